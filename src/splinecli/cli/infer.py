@@ -139,8 +139,10 @@ def watch(context: Context, options: WatchOptions) -> None:
             "--json prints one list at the end, and watch has none", hint="Give --jsonl"
         )
     if given["shard"] is not None:
-        hint = "Watch one folder for each shard"
-        raise UsageError("--shard splits a list of captures, and watch has none", hint=hint)
+        raise UsageError(
+            "--shard splits a list of captures, and watch has none",
+            hint="Watch one folder for each shard",
+        )
     if len(given["captures"]) > 1:
         raise UsageError(
             f"found {given['captures'][0]} after the dashes, expected options of infer"

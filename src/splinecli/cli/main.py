@@ -279,8 +279,8 @@ app = typer.Typer(
     cls=Commands,
     help="Surface normals from a few photographs under known lights (photometric stereo with"
     " SPLINE-Net).",
-    epilog="Exit codes: 0 done, 1 defect, 2 usage, 3 bad input, 4 weights or configuration,"
-    " 5 output, 130 interrupted.",
+    epilog="Exit codes: 0 done, 1 defect, 2 usage, 3 bad input, 4 weights or configuration, 5"
+    " output, 130 interrupted.",
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

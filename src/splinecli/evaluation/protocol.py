@@ -99,8 +99,11 @@ def _read_draw(words: list[str], n_lights: int, path: Path, line: int) -> Draw:
             f"found {len(draw)} light indices, expected at least {MIN_LIGHTS}", path=path, line=line
         )
     if len(draw) != n_lights:
-        problem = f"found {len(draw)} light indices, expected {n_lights} as in the first draw"
-        raise InputError(problem, path=path, line=line)
+        raise InputError(
+            f"found {len(draw)} light indices, expected {n_lights} as in the first draw",
+            path=path,
+            line=line,
+        )
     return draw
 
 

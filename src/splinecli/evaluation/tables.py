@@ -16,10 +16,10 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.errors import printable
 from splinecli.evaluation.protocol import Evaluation, heading, lights_value, protocol_in_words
+from splinecli.maths import Float64Array
 from splinecli.records.documents import ComparisonReport
 
 AVERAGE = "average"  # used instead of a capture's name for the average over all captures
@@ -115,9 +115,7 @@ def _compare_all(maes_deg: dict[str, tuple[float, ...]], **settings: Any) -> lis
     return compared
 
 
-def _paired_test(
-    differences: NDArray[np.float64],
-) -> tuple[tuple[float, float] | None, float | None]:
+def _paired_test(differences: Float64Array) -> tuple[tuple[float, float] | None, float | None]:
     """Return the 95 % interval and the p-value of a t-test of differences (T,) against zero."""
     if len(differences) > 1 and np.abs(differences).max() < _SAME_DEG:
         return (0.0, 0.0), 1.0

@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import OutputError
-from splinecli.maths import Bools, Float32Array, Floats
+from splinecli.maths import Bools, Float32Array, Floats, Picture
 from splinecli.maths.normals import unit
 from splinecli.maths.transfer import encode_srgb
-
-Picture = NDArray[np.uint8]  # an RGB picture (H, W, 3) or a gray picture (H, W) of 8 bits
 
 
 def encode_png(
@@ -36,16 +34,12 @@ def encode_png(
         raise OutputError("the picture cannot be encoded as PNG")
     file = encoded.tobytes()
     # Neither OpenCV nor Pillow writes both 16-bit colours and texts.
-    chunks = [
-        b"tEXt" + f"{keyword}\0{text}".encode("latin-1") for keyword, text in (texts or {}).items()
-    ]
+    chunks = [f"tEXt{key}\0{text}".encode("latin-1") for key, text in (texts or {}).items()]
     chunks += [b"cICP\x01\x01\x00\x01"] if film else []
-    whole = [
-        struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
-        for chunk in chunks
-    ]
-    # behind the header, which is the first chunk of a file
-    return file[:33] + b"".join(whole) + file[33:]
+    added = b""
+    for chunk in chunks:
+        added += struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    return file[:33] + added + file[33:]  # behind the header, which is the first chunk of a file
 
 
 PREVIEW_LIGHT = (-0.72, 0.48, 0.5)  # direction: low, from the upper left, which shows relief best

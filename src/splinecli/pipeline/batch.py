@@ -100,11 +100,11 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[B
     seen: dict[str, Path] = {}
     for folder, member in members.items():
         if member.missing is None and (other := seen.setdefault(member.name, folder)) is not folder:
-            problem = (
+            raise UsageError(
                 f"{other} and {folder} have the same name, so their results would overwrite each"
-                " other"
+                " other",
+                hint="Run them one by one with different -o",
             )
-            raise UsageError(problem, hint="Run them one by one with different -o")
     return [member for folder, member in members.items() if folder in chosen]
 
 
@@ -133,8 +133,11 @@ def _batch_item(folder: Path) -> BatchItem:
         except InputError:
             return BatchItem(folder, folder.name)
     if str(folder) in (*MAPS, *NORMALS, *method_names()):
-        hint = "Write lists with commas, such as --maps albedo,confidence"
-        raise UsageError("the folder does not exist", path=folder, hint=hint)
+        raise UsageError(
+            "the folder does not exist",
+            path=folder,
+            hint="Write lists with commas, such as --maps albedo,confidence",
+        )
     kind = "film" if is_film(folder) else "folder"
     return BatchItem(
         folder, folder.name or str(folder), InputError(f"the {kind} does not exist", path=folder)
@@ -200,14 +203,19 @@ def _failure(member: BatchItem, error: Exception) -> Outcome:
     """
     trace = ""
     if is_out_of_memory(error):
-        hint = "Close other programs, or use smaller images"
-        error = SplinecliError("there is not enough memory", path=member.folder, hint=hint)
+        error = SplinecliError(
+            "there is not enough memory",
+            path=member.folder,
+            hint="Close other programs, or use smaller images",
+        )
     elif isinstance(error, OSError):
         error = as_splinecli_error(error, member.folder)
     elif not isinstance(error, SplinecliError):
         trace = "".join(traceback.format_exception(error))
-        problem = f"{member.name}: {type(error).__name__}: {error}. This is a defect of splinecli"
-        error = SplinecliError(problem, hint="Please report it with the lines above")
+        error = SplinecliError(
+            f"{member.name}: {type(error).__name__}: {error}. This is a defect of splinecli",
+            hint="Please report it with the lines above",
+        )
     if isinstance(error, NoRoomError):
         raise error
     return failed(member.name, error, trace)
@@ -278,11 +286,12 @@ def find_earlier(
             made = "from other input files"
         else:
             return report
-    hint = (
-        "Add --update to redo what changed, --overwrite to redo everything, or choose another"
-        " place with -o"
+    raise ChangedError(
+        f"contains results made {made}",
+        path=target,
+        hint="Add --update to redo what changed, --overwrite to redo everything, or choose another"
+        " place with -o",
     )
-    raise ChangedError(f"contains results made {made}", path=target, hint=hint)
 
 
 def infer_batch(
@@ -393,8 +402,14 @@ def _infer(
     options.check_files()
     estimator = _method(options, options.method_options, sha256)
     if member.missing is None and not os.path.lexists(member.folder):
-        problem = f"the folder does not exist on the worker {this_worker()}"
-        member = replace(member, missing=InputError(problem, path=member.folder, hint=SAME_STORAGE))
+        member = replace(
+            member,
+            missing=InputError(
+                f"the folder does not exist on the worker {this_worker()}",
+                path=member.folder,
+                hint=SAME_STORAGE,
+            ),
+        )
     observer = _Warnings()
     return run_member(member, options, redo, lambda: estimator, observer), observer.found
 
@@ -407,12 +422,12 @@ def _method(options: InferOptions, method: MethodOptions, sha256: str | None) ->
     estimator = make_method(options)
     found = None if estimator.weights is None else estimator.weights["sha256"]
     if found != sha256:
-        problem = (
+        raise ModelError(
             f"the weights have the SHA-256 {found}, expected {sha256} as on the machine of the"
-            " command"
+            " command",
+            path=options.weights,
+            hint="Use the same file, and the same version of splinecli, everywhere",
         )
-        hint = "Use the same file, and the same version of splinecli, everywhere"
-        raise ModelError(problem, path=options.weights, hint=hint)
     return estimator
 
 

@@ -90,8 +90,10 @@ def _client(address: str) -> Client:
             raise ValueError(f"a {identity['type']} answers at {address}")
         return Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
     except Exception as error:
-        hint = "Start one with 'dask scheduler', and workers with 'dask worker ADDRESS'"
-        raise UsageError(f"no Dask scheduler answers at {address}", hint=hint) from error
+        raise UsageError(
+            f"no Dask scheduler answers at {address}",
+            hint="Start one with 'dask scheduler', and workers with 'dask worker ADDRESS'",
+        ) from error
 
 
 @contextmanager
@@ -151,12 +153,11 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
             while cause is not None and not isinstance(cause, OSError):
                 cause = cause.__cause__
             reason = "" if cause is None else f" ({cause.strerror or cause})"
-            problem = f"the processes of --workers cannot be started{reason}"
-            hint = (
-                "Leave --workers out, or raise the limits: each needs a temporary folder and 50"
-                " open files"
-            )
-            raise SplinecliError(problem, hint=hint) from error
+            raise SplinecliError(
+                f"the processes of --workers cannot be started{reason}",
+                hint="Leave --workers out, or raise the limits: each needs a temporary folder and"
+                " 50 open files",
+            ) from error
         try:
             yield cluster
         finally:
@@ -175,12 +176,10 @@ def _address(text: str) -> str:
     try:
         return str(read_json(Path(text))["address"])
     except (OSError, ValueError, KeyError, TypeError):
-        problem = (
-            f"--cluster is {text}; expected an address such as tcp://scheduler:8786, or a"
-            " scheduler file"
-        )
         raise UsageError(
-            problem, hint="'dask scheduler --scheduler-file FILE' writes such a file"
+            f"--cluster is {text}; expected an address such as tcp://scheduler:8786, or a"
+            " scheduler file",
+            hint="'dask scheduler --scheduler-file FILE' writes such a file",
         ) from None
 
 
@@ -231,8 +230,11 @@ class Work:
         try:
             os.chdir(self.folder)
         except OSError as error:
-            problem = f"the folder cannot be entered ({error.strerror})"
-            raise InputError(problem, path=self.folder, hint=SAME_STORAGE) from None
+            raise InputError(
+                f"the folder cannot be entered ({error.strerror})",
+                path=self.folder,
+                hint=SAME_STORAGE,
+            ) from None
         deadline = time.monotonic() + 3.0  # a network drive may show a new file a little later
         while not (probe := Path(self.probe)).exists():
             if not probe.parent.exists() or time.monotonic() > deadline:
@@ -257,8 +259,12 @@ def _do(work: Work, *args: Any) -> Any:
             work.enter()
             return work.do(*args)
     except SplinecliError as error:
-        problem = f"{error.problem} (on the worker {this_worker()})"
-        raise type(error)(problem, path=error.path, line=error.line, hint=error.hint) from None
+        raise type(error)(
+            f"{error.problem} (on the worker {this_worker()})",
+            path=error.path,
+            line=error.line,
+            hint=error.hint,
+        ) from None
 
 
 @dataclass
@@ -298,8 +304,10 @@ class Distributor:
                 began = time.monotonic()
             # A cluster on this machine is considered lost after a minute.
             elif not self.options.address and time.monotonic() - began > 60.0:
-                hint = "If there is too little memory, use fewer. Dask's output says more"
-                raise SplinecliError("the workers stop while they start", hint=hint)
+                raise SplinecliError(
+                    "the workers stop while they start",
+                    hint="If there is too little memory, use fewer. Dask's output says more",
+                )
             while following is not None and len(self.running) < len(workers):
                 limits = (
                     _resources(info).get("MEMORY") or info.get("memory_limit")
@@ -318,11 +326,12 @@ class Distributor:
                         f"it takes about {following.memory / 1e9:.1f} GB of memory, but the"
                         " largest worker has"
                     )
-                    hint = "Start fewer workers on each machine, with more memory each"
                     yield (
                         following,
                         LostError(
-                            f"{problem} {largest / 1e9:.1f} GB", path=following.name, hint=hint
+                            f"{problem} {largest / 1e9:.1f} GB",
+                            path=following.name,
+                            hint="Start fewer workers on each machine, with more memory each",
                         ),
                     )
                 elif not used or used + following.memory <= free_memory:
@@ -349,11 +358,11 @@ class Distributor:
             address: info for address, info in found.items() if _resources(info).get("GPU", 0) >= 1
         }
         if found and not with_gpu and not self.running:
-            hint = (
-                "Start the workers of machines with a GPU with 'dask worker ADDRESS --resources"
-                " GPU=1'"
+            raise UsageError(
+                "no worker has the Dask resource GPU",
+                hint="Start the workers of machines with a GPU with 'dask worker ADDRESS"
+                " --resources GPU=1'",
             )
-            raise UsageError("no worker has the Dask resource GPU", hint=hint)
         return with_gpu
 
     def _submit(self, item: Item, workers: dict[str, dict[str, Any]]) -> None:
@@ -386,12 +395,12 @@ class Distributor:
             return
         except KilledWorker as error:
             last = getattr(error.last_worker, "address", error.last_worker)
-            problem = f"its worker was lost {error.allowed_failures + 1} times, the last one {last}"
-            hint = (
-                "If there was too little memory, start fewer workers on each machine, or make the"
-                " images smaller"
+            result = LostError(
+                f"its worker was lost {error.allowed_failures + 1} times, the last one {last}",
+                path=item.name,
+                hint="If there was too little memory, start fewer workers on each machine, or make"
+                " the images smaller",
             )
-            result = LostError(problem, path=item.name, hint=hint)
         del self.running[future]
         yield item, result
 
@@ -401,8 +410,10 @@ def _resources(info: dict[str, Any]) -> dict[str, float]:
 
 
 def _scheduler_lost() -> SplinecliError:
-    hint = "Run the same command again. It skips captures that are already done"
-    return SplinecliError("the connection to the Dask scheduler was lost", hint=hint)
+    return SplinecliError(
+        "the connection to the Dask scheduler was lost",
+        hint="Run the same command again. It skips captures that are already done",
+    )
 
 
 @contextmanager

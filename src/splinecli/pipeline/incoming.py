@@ -57,8 +57,11 @@ def unpacked(
             e.name for e in folder.iterdir() if e.name not in known and not e.name.startswith(".")
         )
         if others and (sizes or not all(map(_FRAME.fullmatch, others))):
-            problem = f"contains {others[0]}, which is not a frame of this film"
-            raise OutputError(problem, path=folder, hint="Move it, or choose another -o")
+            raise OutputError(
+                f"contains {others[0]}, which is not a frame of this film",
+                path=folder,
+                hint="Move it, or choose another -o",
+            )
         whole = all(
             is_plain(folder / name) and (folder / name).stat().st_size == sizes[name]
             for name in sizes
@@ -66,11 +69,12 @@ def unpacked(
         if of_film == stamp and whole and redo != "all":
             return folder
         if of_film not in (stamp, "") and redo == "nothing":
-            problem = "contains the frames of another film, or of an earlier version of this one"
-            hint = (
-                "Add --update to extract the frames of this film, or choose another place with -o"
+            raise OutputError(
+                "contains the frames of another film, or of an earlier version of this one",
+                path=folder,
+                hint="Add --update to extract the frames of this film, or choose another place with"
+                " -o",
             )
-            raise OutputError(problem, path=folder, hint=hint)
         with observer.progress(f"{capture.stem}: choosing frames", 1) as advance:
             numbers = choose_frames(capture)
             advance(1)
@@ -158,12 +162,10 @@ class Arrivals:
         ready: dict[str, Path] = {}
         for path in captures:
             seen = self._seen.get(path)
-            recent = (
-                seen is not None and seen.returned and now - seen.looked_at < SECONDS_BETWEEN_FILES
-            )
             if (
                 seen is not None
-                and recent
+                and seen.returned
+                and now - seen.looked_at < SECONDS_BETWEEN_FILES
                 and all(_changed(place) == when for place, when in seen.folders.items())
             ):
                 continue
@@ -217,9 +219,6 @@ def _stamp(capture: Path) -> tuple[Stamp, dict[str, int]]:
                 status = os.stat(os.path.join(place, name))  # noqa: PTH116, PTH118 - thousands of files a second
             except OSError:
                 continue
-            count, size, newest = (
-                count + 1,
-                size + status.st_size,
-                max(newest, status.st_mtime_ns, status.st_ctime_ns),
-            )
+            count, size = count + 1, size + status.st_size
+            newest = max(newest, status.st_mtime_ns, status.st_ctime_ns)
     return (count, size, newest), folders

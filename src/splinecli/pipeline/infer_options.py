@@ -379,14 +379,18 @@ class Reading(Record, frozen=True, kw_only=True):
             ("--light-format", self.light_format != "xyz", of_file),
         ):
             if self.finds_lights and given:
-                problem = f"--lights estimate {reason}, so it contradicts {option}"
-                raise UsageError(problem, hint=f"Leave {option} out, or give a light file")
+                raise UsageError(
+                    f"--lights estimate {reason}, so it contradicts {option}",
+                    hint=f"Leave {option} out, or give a light file",
+                )
         add_it = "Add it, or leave both out"
         if self.crosstalk is not None and not self.lights_in_channels:
             raise UsageError("--crosstalk needs --lights-in-channels", hint=add_it)
         if self.align and self.scale is not None:
-            problem = "--align needs every row and column, so it contradicts --scale"
-            raise UsageError(problem, hint="Leave one out, or use --crop for a first look")
+            raise UsageError(
+                "--align needs every row and column, so it contradicts --scale",
+                hint="Leave one out, or use --crop for a first look",
+            )
         if self.first_light is not None:
             if not self.finds_lights:
                 raise UsageError("--first-light needs --lights estimate", hint=add_it)
@@ -583,11 +587,15 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         count = self.n_lights if self.light_indices is None else len(self.light_indices)
         if self.align and count is not None and count < MIN_IMAGES:
             option = "--n-lights" if self.light_indices is None else "--light-indices"
-            problem = f"{option} leaves {count} images, but --align needs at least {MIN_IMAGES}"
-            raise UsageError(problem, hint="Use more lights, or leave --align out")
+            raise UsageError(
+                f"{option} leaves {count} images, but --align needs at least {MIN_IMAGES}",
+                hint="Use more lights, or leave --align out",
+            )
         if self.finds_lights and self.refine_lights:
-            problem = "--lights estimate refines the lights that it finds"
-            raise UsageError(problem, hint="Leave --refine-lights out")
+            raise UsageError(
+                "--lights estimate refines the lights that it finds",
+                hint="Leave --refine-lights out",
+            )
         check_method(self.method)
         if self.surface and self.pixel_size is not None:
             check_pixel_size(self.pixel_size)
@@ -671,8 +679,10 @@ class Shard(NamedTuple):
             )
         number, count = int(found[1]), int(found[2])
         if not 1 <= number <= count:
-            problem = f"--shard is {number}/{count}; expected I/N with I from 1 to N"
-            raise UsageError(problem, hint="If your job numbers count from 0, add 1")
+            raise UsageError(
+                f"--shard is {number}/{count}; expected I/N with I from 1 to N",
+                hint="If your job numbers count from 0, add 1",
+            )
         return cls(number, count)
 
 

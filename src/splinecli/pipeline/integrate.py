@@ -10,7 +10,6 @@ from typing import Any, get_args
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from splinecli.capture import read_image, read_normal_map
 from splinecli.capture.formats.images import ExpectedSize, check_memory
@@ -18,6 +17,7 @@ from splinecli.capture.formats.normal_files import read_depth
 from splinecli.capture.linearise import parse_window
 from splinecli.capture.near_lamps import read_camera_matrix
 from splinecli.errors import InputError, SplinecliError
+from splinecli.maths import Float64Array, Floats, Picture
 from splinecli.maths.normals import Convention, encode_picture
 from splinecli.maths.pixel_grid import ray_basis
 from splinecli.pictures.maps import encode_png
@@ -50,9 +50,9 @@ from splinecli.system.publishing import held_folder, new_files
 
 def view_of_report(
     report: Mapping[str, Any],
-    camera_matrix: NDArray[np.floating] | None = None,
+    camera_matrix: Floats | None = None,
     pixel_size_mm: float | None = None,
-) -> tuple[NDArray[np.float64] | None, float | None]:
+) -> tuple[Float64Array | None, float | None]:
     """Return the camera matrix and the pixel size in millimetres of the normal map described by a
     report of `infer`.
 
@@ -180,7 +180,7 @@ def _read_textures(
     return picture, Textures(colours, _read_picture(gloss, shape), reflection)
 
 
-def _read_picture(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+def _read_picture(path: Path, shape: tuple[int, ...]) -> Picture:
     """Return an image as a picture (H, W, 3) of 8 bits. Raises InputError if its size is not (H,
     W).
     """
@@ -225,8 +225,9 @@ def _find_normal_map(folder: Path) -> Path:
         problem = f"the folder has no whole results of infer: it {error}"
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         problem = f"the folder has no whole results of infer: its {REPORT} is damaged"
-    hint = "Give a folder that 'splinecli infer' wrote, or one of its files"
-    raise InputError(problem, path=folder, hint=hint)
+    raise InputError(
+        problem, path=folder, hint="Give a folder that 'splinecli infer' wrote, or one of its files"
+    )
 
 
 def _report_of(path: Path) -> dict[str, Any] | None:
@@ -248,5 +249,8 @@ def _report_of(path: Path) -> dict[str, Any] | None:
         if is_finite and used["convention"] in get_args(Convention):
             return report
     problem = "is damaged, or from another version: it does not say how the normal map beside it"
-    hint = "Run 'splinecli infer' again, or move the normal map to another folder"
-    raise InputError(f"{problem} was made", path=path.parent / REPORT, hint=hint)
+    raise InputError(
+        f"{problem} was made",
+        path=path.parent / REPORT,
+        hint="Run 'splinecli infer' again, or move the normal map to another folder",
+    )

@@ -137,20 +137,26 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         if parse_transfer(self.transfer) != 1 and not (self.gray_ball or self.gray_card):
-            hint = "Leave it out: the light directions do not depend on the curve"
-            raise UsageError("--transfer needs --gray-ball or --gray-card", hint=hint)
+            raise UsageError(
+                "--transfer needs --gray-ball or --gray-card",
+                hint="Leave it out: the light directions do not depend on the curve",
+            )
         if self.ball_diameter is not None and len(self.balls) < 2:
             hint = "Photograph a second ball, or the same ball at another place: one ball gives no"
             raise UsageError("--ball-diameter needs two balls or more", hint=f"{hint} positions")
         if self.lights_in_channels and not self.gray_ball:
-            hint = "Photograph a matte gray or white ball"
-            raise UsageError("--lights-in-channels needs --gray-ball", hint=hint)
+            raise UsageError(
+                "--lights-in-channels needs --gray-ball",
+                hint="Photograph a matte gray or white ball",
+            )
 
         for option, values in (("--circle", self.circles), ("--mask", self.masks)):
             if values and len(values) != len(self.balls):
                 times = "once" if len(values) == 1 else f"{len(values)} times"
-                problem = f"{option} is given {times} for {len(self.balls)} balls"
-                raise UsageError(problem, hint="Give it once for each ball, in the same order")
+                raise UsageError(
+                    f"{option} is given {times} for {len(self.balls)} balls",
+                    hint="Give it once for each ball, in the same order",
+                )
 
 
 def parse_level(text: str) -> tuple[tuple[int, int], ...]:
@@ -163,8 +169,10 @@ def parse_level(text: str) -> tuple[tuple[int, int], ...]:
         points = tuple((int(x), int(y)) for x, y in (point.split(",") for point in text.split()))
         if len(points) >= 3:
             return points
-    problem = f'--level is {text!r}; expected plane, or at least three points "X,Y X,Y X,Y"'
-    raise UsageError(problem, hint="Put quotation marks around the points")
+    raise UsageError(
+        f'--level is {text!r}; expected plane, or at least three points "X,Y X,Y X,Y"',
+        hint="Put quotation marks around the points",
+    )
 
 
 class IntegrateOptions(Display, frozen=True, kw_only=True):
@@ -496,20 +504,26 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
 
         check_light_error(self.light_error_deg, refines=self.refine_lights)
         if self.lights not in (None, ESTIMATE):
-            hint = "Without it, the light files of the captures are used"
-            raise UsageError(f"--lights is {self.lights}; expected {ESTIMATE}", hint=hint)
+            raise UsageError(
+                f"--lights is {self.lights}; expected {ESTIMATE}",
+                hint="Without it, the light files of the captures are used",
+            )
         if self.lights is not None and (self.refine_lights or any(self.light_noise_deg)):
             problem = "--lights estimate uses no light file, so it contradicts --refine-lights and"
             raise UsageError(f"{problem} --light-noise-deg", hint="Leave these out")
         if self.cluster != HERE and self.jobs is not None:
-            hint = "Leave it out: a worker scores one trial at a time"
-            raise UsageError("--jobs contradicts --workers and --cluster", hint=hint)
+            raise UsageError(
+                "--jobs contradicts --workers and --cluster",
+                hint="Leave it out: a worker scores one trial at a time",
+            )
         for name in self.names:
             check_method(name)
         with_maps = self.figures and any(METHODS[name].observation_maps for name in self.names)
         if self.pixels and not with_maps:
-            problem = "--pixel chooses the observation maps that --figures shows"
-            raise UsageError(problem, hint="Add --figures and --method spline-net")
+            raise UsageError(
+                "--pixel chooses the observation maps that --figures shows",
+                hint="Add --figures and --method spline-net",
+            )
         _ = self.protocols
 
     @property

@@ -111,8 +111,9 @@ class Record(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         given = {field.name for field in fields(self) if getattr(self, field.name) != field.default}
         for first, second, hint in self.CONFLICTS:
             if first in given and second in given:
-                problem = f"{titles[first]} and {titles[second]} contradict each other"
-                raise UsageError(problem, hint=hint)
+                raise UsageError(
+                    f"{titles[first]} and {titles[second]} contradict each other", hint=hint
+                )
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with new values for some fields."""
@@ -160,8 +161,9 @@ def _converted(kind: Any, option: Option, given: Any, title: str) -> Any:
     is_name = PATH in _metadata(kind)
     is_file = (is_name or isinstance(value, Path)) and not option.is_argument
     if is_file and str(value).startswith("-"):
-        problem = f"{title} needs a file or folder, found {value}"
-        raise UsageError(problem, hint="Name it after the option")
+        raise UsageError(
+            f"{title} needs a file or folder, found {value}", hint="Name it after the option"
+        )
     return str(value) if is_name else value
 
 

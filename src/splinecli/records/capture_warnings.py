@@ -338,8 +338,15 @@ def mask_inverted(name: str) -> CaptureWarning:
 
 def eight_bit(any_8_bit: bool) -> list[CaptureWarning]:
     """Warn of images with 8 bits, if there are any."""
-    text = "The images have 8 bits; 16-bit linear images give better normals."
-    return [CaptureWarning(EIGHT_BIT, text)] if any_8_bit else []
+    return (
+        [
+            CaptureWarning(
+                EIGHT_BIT, "The images have 8 bits; 16-bit linear images give better normals."
+            )
+        ]
+        if any_8_bit
+        else []
+    )
 
 
 def estimated_lights(errors_deg: Float64Array) -> CaptureWarning:

@@ -6,11 +6,10 @@ from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture import CaptureSource
-from splinecli.maths import Floats
-from splinecli.pictures.maps import Picture, encode_png
+from splinecli.maths import Bools, Float32Array, Floats, Picture
+from splinecli.pictures.maps import encode_png
 from splinecli.records.output_files import MAPS, OutputMap
 from splinecli.results import material  # noqa: F401 - its map is in MAP_FUNCTIONS once it is imported
 from splinecli.results.map_values import MAP_FUNCTIONS, Progress
@@ -34,16 +33,14 @@ def make_map(
     source: CaptureSource,
     estimate: NormalEstimate,
     progress: Progress = lambda: None,
-) -> NDArray[np.float32] | None:
+) -> Float32Array | None:
     """Return the values of a map, or None if the capture or the method does not provide it. Raises
     InputError.
     """
     return MAP_FUNCTIONS[row.name].make(source, estimate, progress)
 
 
-def map_picture(
-    row: OutputMap, values: Floats, mask: NDArray[np.bool_], scale: float | None = None
-) -> Picture:
+def map_picture(row: OutputMap, values: Floats, mask: Bools, scale: float | None = None) -> Picture:
     """Return a picture of a map's values (H, W) or (H, W, C); None uses the row's own scale."""
     scales = [] if row.scale is None else [row.scale if scale is None else scale]
     return MAP_FUNCTIONS[row.name].picture(values, mask, *scales)
@@ -51,8 +48,8 @@ def map_picture(
 
 def map_files(
     row: OutputMap,
-    values: NDArray[np.float32],
-    mask: NDArray[np.bool_],
+    values: Float32Array,
+    mask: Bools,
     formats: Collection[str],
     *,
     scale: float | None = None,

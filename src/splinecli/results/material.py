@@ -11,9 +11,8 @@ import numpy as np
 from splinecli.capture import CaptureSource
 from splinecli.capture.linearise import take_pixels
 from splinecli.estimate.inference import lighting_on
-from splinecli.maths import Bools, Float32Array
+from splinecli.maths import Bools, Float32Array, Picture
 from splinecli.maths.transfer import encode_srgb
-from splinecli.pictures.maps import Picture
 from splinecli.records.capture_warnings import GRAY_MATERIAL, ROUGHNESS_UNDETERMINED, CaptureWarning
 from splinecli.records.documents import MaterialFacts
 from splinecli.results.map_values import Progress, colours_of_surface, makes
@@ -111,16 +110,22 @@ def material_warnings(facts: MaterialFacts) -> list[CaptureWarning]:
     """Return what the images do not determine about a material."""
     warnings = []
     if facts.gray:
-        text = "The images are gray, so base_colour shows brightness alone."
-        warnings.append(CaptureWarning(GRAY_MATERIAL, text))
-    if facts.determined < _LEAST_DETERMINED:
-        text = (
-            f"The images do not determine the roughness: {facts.determined:.1%} of the pixels have"
-            f" a confidence of {_CONFIDENT} or more. Highlights are too few, or the normals too"
-            f" uncertain. roughness.npy has the most likely values, {facts.median_roughness:.2f}"
-            " in the median. Add lights, some near the camera axis."
+        warnings.append(
+            CaptureWarning(
+                GRAY_MATERIAL, "The images are gray, so base_colour shows brightness alone."
+            )
         )
-        warnings.append(CaptureWarning(ROUGHNESS_UNDETERMINED, text))
+    if facts.determined < _LEAST_DETERMINED:
+        warnings.append(
+            CaptureWarning(
+                ROUGHNESS_UNDETERMINED,
+                f"The images do not determine the roughness: {facts.determined:.1%} of the pixels"
+                f" have a confidence of {_CONFIDENT} or more. Highlights are too few, or the"
+                " normals too uncertain. roughness.npy has the most likely values,"
+                f" {facts.median_roughness:.2f} in the median. Add lights, some near the camera"
+                " axis.",
+            )
+        )
     return warnings
 
 

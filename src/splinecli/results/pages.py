@@ -12,21 +12,14 @@ from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli._version import __version__
 from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.images import decode_image, image_bytes
 from splinecli.errors import InputError, OutputError
+from splinecli.maths import Bools, Float32Array, Picture
 from splinecli.maths.normals import unit
-from splinecli.pictures.maps import (
-    PREVIEW_LIGHT,
-    TICKS,
-    TOP_DEG,
-    Picture,
-    colour_errors,
-    encode_png,
-)
+from splinecli.pictures.maps import PREVIEW_LIGHT, TICKS, TOP_DEG, colour_errors, encode_png
 from splinecli.records.output_files import MAPS, NORMALS, PAGE, REPORT
 from splinecli.results.files import read_report
 from splinecli.results.maps import map_picture
@@ -66,12 +59,12 @@ _TIMES = "\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}"
 
 def result_page(
     report: Mapping[str, Any],
-    normal_map: NDArray[np.float32],
-    mask: NDArray[np.bool_],
+    normal_map: Float32Array,
+    mask: Bools,
     *,
-    values: Mapping[str, NDArray[np.float32]] | None = None,
-    material: NDArray[np.float32] | None = None,
-    error_map_deg: NDArray[np.float32] | None = None,
+    values: Mapping[str, Float32Array] | None = None,
+    material: Float32Array | None = None,
+    error_map_deg: Float32Array | None = None,
     light_plot: bytes | None = None,
 ) -> str:
     """Return one HTML file that contains everything it shows and loads nothing from a network.
@@ -153,7 +146,7 @@ def result_page(
     )
 
 
-def split_normals(normals: NDArray[np.float32], mask: NDArray[np.bool_]) -> tuple[Picture, Picture]:
+def split_normals(normals: Float32Array, mask: Bools) -> tuple[Picture, Picture]:
     """Return unit normals (H, W, 3) as two RGB pictures: the upper 8 bits of (n + 1) / 2, and the
     LOW_BITS below.
 
@@ -166,7 +159,7 @@ def split_normals(normals: NDArray[np.float32], mask: NDArray[np.bool_]) -> tupl
 
 
 def _first_pictures(
-    maps: Mapping[str, Picture], normals: NDArray[np.float32], mask: NDArray[np.bool_]
+    maps: Mapping[str, Picture], normals: Float32Array, mask: Bools
 ) -> dict[str, Picture]:
     """Return pictures of at most 100,000 pixels of the maps, which a browser shows while it loads
     the others.
@@ -181,9 +174,7 @@ def _first_pictures(
     return first
 
 
-def _reduce(
-    values: NDArray[np.float32], known: NDArray[np.bool_], largest: int
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _reduce(values: Float32Array, known: Bools, largest: int) -> tuple[Float32Array, Bools]:
     """Return values (H, W, C) and their mask, reduced to at most `largest` pixels and sides of at
     most LONGEST_SIDE.
 
@@ -205,7 +196,7 @@ def _reduce(
     return np.divide(total, weight, out=np.zeros_like(total), where=weight > 0), weight[..., 0] > 0
 
 
-def _size(mask: NDArray[np.bool_]) -> str:
+def _size(mask: Bools) -> str:
     height, width = mask.shape
     return f"{width}{_TIMES}{height}"
 

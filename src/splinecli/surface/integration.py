@@ -232,8 +232,10 @@ def _refuse(wrong: Bools, mask: Bools, what: str) -> None:
     if wrong.any():
         row, column = np.argwhere(mask)[wrong.argmax()]
         problem = f"{np.count_nonzero(wrong)} of {wrong.size} values of the prior are {what}"
-        hint = "Give them in the unit of the result, and NaN where nothing is known"
-        raise InputError(f"{problem}, the first in row {row}, column {column}", hint=hint)
+        raise InputError(
+            f"{problem}, the first in row {row}, column {column}",
+            hint="Give them in the unit of the result, and NaN where nothing is known",
+        )
 
 
 def _check_prior(surface: _Surface) -> None:
@@ -258,9 +260,11 @@ def _check_prior(surface: _Surface) -> None:
     steeper = both / max(float(wanted @ wanted), 1e-12)
     # A blurred prior is flatter than the normals.
     if abs(correlation) > 0.3 and not 0.2 < steeper < 5.0:  # slopes of prior and normals
-        problem = f"the prior is {steeper:.2g} times as steep as the normals, expected about 1"
         hint = "Give heights towards the camera, or depths with a camera matrix, in the unit of the"
-        raise InputError(problem, hint=f"{hint} result")
+        raise InputError(
+            f"the prior is {steeper:.2g} times as steep as the normals, expected about 1",
+            hint=f"{hint} result",
+        )
     assert surface.prior is not None
     farthest = 3.0 * max(np.ptp(np.flatnonzero(surface.mask.any(axis=axis))) + 1 for axis in (0, 1))
     away = np.abs(surface.prior - np.nanmedian(surface.prior)) > farthest

@@ -48,8 +48,9 @@ def plane_slopes(
     terms = np.stack((x, y, np.ones(len(z))), axis=1)
     sizes = np.linalg.svd(terms[:, :2], compute_uv=False)
     if sizes[-1] < 1e-2 * sizes[0]:
-        hint = "Choose points that span a plane"
-        raise UsageError("the points of --level are in a line", hint=hint)
+        raise UsageError(
+            "the points of --level are in a line", hint="Choose points that span a plane"
+        )
     weights, plane = np.ones(len(z)), np.zeros(3)
     for _ in range(1 if points else _FITS):
         weighted = terms * weights[:, None]

@@ -48,8 +48,9 @@ class SurfaceSettings:
         if self.level is None:
             option, hint = "--pixel-aspect", "Its fx and fy describe the pixels"
         if camera_matrix is not None and (self.level is not None or self.pixel_aspect != 1):
-            problem = f"{option} needs an orthographic camera, but there is a camera matrix"
-            raise UsageError(problem, hint=hint)
+            raise UsageError(
+                f"{option} needs an orthographic camera, but there is a camera matrix", hint=hint
+            )
 
 
 def make_surface(

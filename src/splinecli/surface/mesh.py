@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Integers
+from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Indices, Integers, Picture
 from splinecli.maths.normals import unit
 from splinecli.maths.pixel_grid import Blocks, focal_length, image_points, pixel_rays, ray_basis
 from splinecli.system.machine import import_extra
@@ -38,19 +38,19 @@ class SurfaceMesh:
     # (V, 2) float32, the places of the vertices in the textures: u from 0 at the left to 1 at the
     # right, v from 0 at the top to 1 at the bottom, as in glTF
     uvs: Float32Array
-    texture: NDArray[np.uint8] | None = None  # (H, W, 3) uint8, sRGB colours, or None
+    texture: Picture | None = None  # (H, W, 3) uint8, sRGB colours, or None
     # (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None if
     # `normals` are exact.
-    normal_texture: NDArray[np.uint8] | None = None
+    normal_texture: Picture | None = None
     # (H, W, 3) uint8, linear, roughness in green and metalness in blue, as in glTF; or None for a
     # matte surface
-    gloss: NDArray[np.uint8] | None = None
+    gloss: Picture | None = None
     # (H, W) float32, 0.5 for a reflectance of 4 % at normal incidence; None for that everywhere
     specular: Float32Array | None = None
     tangents: Float32Array | None = None  # (V, 3) float32, unit; only with a normal texture
 
     @property
-    def colours(self) -> NDArray[np.uint8] | None:
+    def colours(self) -> Picture | None:
         """The colours of the vertices in the texture, (V, 3) uint8."""
         if self.texture is None:
             return None
@@ -63,8 +63,8 @@ class SurfaceMesh:
 class Textures:
     """Pictures for a mesh, each (H, W) or (H, W, 3); see the fields of SurfaceMesh."""
 
-    texture: NDArray[np.uint8] | None = None
-    gloss: NDArray[np.uint8] | None = None
+    texture: Picture | None = None
+    gloss: Picture | None = None
     specular: Float32Array | None = None
 
     def put_on(self, mesh: SurfaceMesh, mask: Bools) -> SurfaceMesh:
@@ -242,8 +242,9 @@ def decimated_mesh(
         mesh.vertices.astype(np.float64) / pixel, mesh.triangles, target_count=n_triangles
     )
     if not len(triangles):
-        problem = f"no mesh of {n_triangles} triangles is left"
-        raise InputError(problem, hint="Ask for more with --decimate")
+        raise InputError(
+            f"no mesh of {n_triangles} triangles is left", hint="Ask for more with --decimate"
+        )
     vertices = vertices * pixel
     normals = vertex_normals(vertices, triangles)
     tangents = _tangents(vertices, normals, camera_matrix)
@@ -309,7 +310,7 @@ def _normal_texture(
     normals: Float64Array,
     tangents: Float64Array,
     normal_map: Floats,
-) -> NDArray[np.uint8]:
+) -> Picture:
     """Return the normal texture (H, W, 3) of a mesh. Pixels outside the mesh have the value of the
     nearest inside.
 
@@ -348,7 +349,7 @@ def _in_frame(
 
 def _covered_pixels(
     points: Float64Array, triangles: Integers, shape: tuple[int, ...]
-) -> Iterator[tuple[NDArray[np.intp], Float64Array, NDArray[np.intp], NDArray[np.intp]]]:
+) -> Iterator[tuple[Indices, Float64Array, Indices, Indices]]:
     """Yield the pixels whose centres are in triangles: triangle (Q,), barycentric coordinates (Q,
     3), row, column.
     """
@@ -390,7 +391,7 @@ def _barycentric_forms(corners: Float64Array) -> Float64Array:
     return np.concatenate((normal, -np.einsum("tcx,tcx->tc", normal, following)[..., None]), axis=2)
 
 
-def _ranges(first: Float64Array, last: Float64Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _ranges(first: Float64Array, last: Float64Array) -> tuple[Indices, Indices]:
     """Return the whole numbers from each first to its last, and before them the number of the range
     of each.
     """

@@ -15,9 +15,9 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.errors import OutputError
+from splinecli.maths import Float32Array, Floats, Picture
 from splinecli.maths.transfer import decode_transfer, encode_srgb
 from splinecli.records.output_files import SURFACE_FILES
 from splinecli.system.machine import import_extra
@@ -36,12 +36,12 @@ GRAY = 204  # colour of a mesh without a texture, of 255
 class Surface:
     """A depth map and its mesh."""
 
-    depth: NDArray[np.floating]  # (H, W), NaN outside the object
+    depth: Floats  # (H, W), NaN outside the object
     mesh: SurfaceMesh  # the mesh of the same surface
     unit: str  # the name of the unit of both
     millimetres: float  # the length of this unit in a file of glTF
     # (H, W, 3), the normals of a surface that was levelled
-    level_normals: NDArray[np.float32] | None = None
+    level_normals: Float32Array | None = None
 
 
 def encode_surface(
@@ -116,7 +116,7 @@ def _encode_glb(surface: Surface) -> bytes:
     return glb
 
 
-def _add_specular(buffers: Any, tree: Any, specular: NDArray[np.float32]) -> None:
+def _add_specular(buffers: Any, tree: Any, specular: Float32Array) -> None:
     """Add KHR_materials_specular to a glTF file of one material: the reflectance (H, W) relative to
     the usual one.
     """
@@ -135,7 +135,7 @@ def _add_specular(buffers: Any, tree: Any, specular: NDArray[np.float32]) -> Non
     tree["extensionsUsed"] = ["KHR_materials_specular"]
 
 
-def _encode_texture(picture: NDArray[np.uint8]) -> bytes:
+def _encode_texture(picture: Picture) -> bytes:
     from PIL import Image
 
     file = io.BytesIO()
@@ -201,7 +201,7 @@ def _encode_obj(surface: Surface) -> dict[str, bytes]:
     return {"mesh.obj": text.encode(), **files}
 
 
-def encode_tiff(values: NDArray[np.float32], description: str) -> bytes:
+def encode_tiff(values: Float32Array, description: str) -> bytes:
     """Return the TIFF file of a map (H, W) or (H, W, C)."""
     import tifffile
 
@@ -267,7 +267,7 @@ def _textured(mesh: SurfaceMesh, material: Any) -> Any:
     return trimesh.visual.TextureVisuals(mesh.uvs * (1, -1) + (0, 1), material)
 
 
-def encode_exr(pixels: NDArray[np.floating], attributes: Mapping[str, str]) -> bytes:
+def encode_exr(pixels: Floats, attributes: Mapping[str, str]) -> bytes:
     """Return the file of a map of float16 or float32, without loss (ZIP), with texts by name in its
     header.
 

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.maths import Bools, Floats
+from splinecli.maths import Bools, Floats, Picture
 from splinecli.maths.normals import encode_picture
-from splinecli.pictures.maps import Picture
 
 if TYPE_CHECKING:
     from splinecli.workshop.pixel_sets.store import Entry, PixelSet

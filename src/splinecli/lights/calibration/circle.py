@@ -86,12 +86,10 @@ def circle_from_mask(mask: Bools) -> Circle:
     outline = outline + 0.5 * unit(outline - (circle.x, circle.y))
     circle = replace(circle, radius=circle.radius + 0.5, points=outline)
     if circle.visible < _MIN_VISIBLE:
-        problem = (
-            f"only {100 * circle.visible:.0f} % of the mask's outline is on a circle, expected a"
-            " ball"
-        )
         raise InputError(
-            problem, hint="Mark only the ball in the mask, or give its circle with --circle X,Y,R"
+            f"only {100 * circle.visible:.0f} % of the mask's outline is on a circle, expected a"
+            " ball",
+            hint="Mark only the ball in the mask, or give its circle with --circle X,Y,R",
         )
     return circle
 

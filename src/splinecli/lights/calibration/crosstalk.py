@@ -50,11 +50,12 @@ def measure_crosstalk(
             f"found {count} colour images of the gray ball and {len(light_directions)} lights,"
             " expected three"
         )
-        hint = (
-            "For each colour image, photograph the mirror ball under each lamp alone, in the order"
-            " R, G, B"
+        raise InputError(
+            f"{problem} lights for each image",
+            path=files.folder,
+            hint="For each colour image, photograph the mirror ball under each lamp alone, in the"
+            " order R, G, B",
         )
-        raise InputError(f"{problem} lights for each image", path=files.folder, hint=hint)
     mask, normals = target_normals(files, common_size(files.facts)[0][:2], "ball")
     check_exposures(files.facts)
     capture = CaptureSource(

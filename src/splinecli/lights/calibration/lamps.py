@@ -59,8 +59,10 @@ def measure_light_intensities(
     """
     n_lights = len(light_directions)
     if len(files.images) != n_lights:
-        problem = f"found {len(files.images)} images, expected {n_lights}, one for each light"
-        raise InputError(problem, path=files.folder)
+        raise InputError(
+            f"found {len(files.images)} images, expected {n_lights}, one for each light",
+            path=files.folder,
+        )
     mask, normals = target_normals(files, common_size(files.facts)[0][:2], target)
     check_exposures(files.facts)
     capture = CaptureSource(
@@ -90,12 +92,12 @@ def measure_light_intensities(
         ratios = ratios[(cosines[:, position] > smallest) & ~np.isnan(ratios).any(axis=1)]
         intensity = np.median(ratios, axis=0) if len(ratios) >= 50 else np.zeros(1)
         if not ((intensity > 0) & np.isfinite(intensity)).all():
-            problem = (
+            raise InputError(
                 "the target is dark or overexposed under this light, so the light's intensity is"
-                " unknown"
+                " unknown",
+                path=path,
+                hint="Every light needs an image of the target that is neither black nor saturated",
             )
-            hint = "Every light needs an image of the target that is neither black nor saturated"
-            raise InputError(problem, path=path, hint=hint)
         intensities[position] = intensity
     return np.asarray(intensities / intensities.mean())
 
