@@ -34,7 +34,7 @@ from splinecli.pipeline.infer import (
 )
 from splinecli.pipeline.infer_options import HERE, ClusterOptions, InferOptions, Redo, Shard
 from splinecli.records.output_files import MAPS, NORMALS, REPORT, own_files
-from splinecli.results.files import UnfinishedError, read_report
+from splinecli.results.files import UNUSABLE, UnfinishedError, read_report
 from splinecli.results.pages import (
     INDEX,
     Entry,
@@ -79,10 +79,9 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[B
     Raises UsageError if images are given instead of their folder, two captures have the same name,
     or a "folder" that does not exist is the name of a map, format or method.
     """
-    are_files = (os.path.isfile(path) for path in folders)  # noqa: PTH113 - Path raises for long names
     if folders and all(
-        path.suffix.lower() in IMAGE_SUFFIXES and is_file
-        for path, is_file in zip(folders, are_files, strict=True)
+        path.suffix.lower() in IMAGE_SUFFIXES and os.path.isfile(path)  # noqa: PTH113 - Path raises for long names
+        for path in folders
     ):
         given = "an image was" if len(folders) == 1 else f"{len(folders)} images were"
         raise UsageError(
@@ -123,15 +122,15 @@ def _batch_item(folder: Path) -> BatchItem:
     option.
     """
     # If a folder cannot be read, the error is reported when that capture is processed.
+    name = folder.name
     try:
         exists = find_mode(folder) is not None
+        if exists:
+            name = capture_name(folder)
     except InputError:
         exists = True
     if exists:
-        try:
-            return BatchItem(folder, capture_name(folder))
-        except InputError:
-            return BatchItem(folder, folder.name)
+        return BatchItem(folder, name)
     if str(folder) in (*MAPS, *NORMALS, *method_names()):
         raise UsageError(
             "the folder does not exist",
@@ -139,9 +138,8 @@ def _batch_item(folder: Path) -> BatchItem:
             hint="Write lists with commas, such as --maps albedo,confidence",
         )
     kind = "film" if is_film(folder) else "folder"
-    return BatchItem(
-        folder, folder.name or str(folder), InputError(f"the {kind} does not exist", path=folder)
-    )
+    missing = InputError(f"the {kind} does not exist", path=folder)
+    return BatchItem(folder, name or str(folder), missing)
 
 
 Status = Literal["done", "skipped", "changed", "missing", "failed"]
@@ -254,34 +252,21 @@ def find_earlier(
         if found is None:
             return None
         if not is_plain(target / REPORT) and target.samefile(folder):
-            problem, hint = (
-                f"contains {found}, but no {REPORT}, and is the folder of the capture",
-                "Add --overwrite",
-            )
             raise OutputError(
-                problem, path=target, hint=f"{hint}, or choose another place with -o"
+                f"contains {found}, but no {REPORT}, and is the folder of the capture",
+                path=target,
+                hint="Add --overwrite, or choose another place with -o",
             ) from None
         warn(f"{target}: {error}, so it is computed again")
         return None
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        OverflowError,
-        SplinecliError,
-    ):
+    except (*UNUSABLE, OverflowError, SplinecliError):
         made = "by another version"
     else:
         if version != __version__:
             made = f"by version {version}"
         elif names := options.changes(earlier):
-            made = (
-                f"with another {names[0]}"
-                if len(names) == 1
-                else f"with other options ({', '.join(names)})"
-            )
+            several = f"other options ({', '.join(names)})"
+            made = f"with {several if len(names) > 1 else f'another {names[0]}'}"
         elif stamp != inputs_sha256(options.open(folder), options.weights):
             made = "from other input files"
         else:

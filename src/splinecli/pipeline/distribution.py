@@ -107,13 +107,8 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     threads = max(1, min(threads, int(of_user)) if of_user.isdecimal() else threads)
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
     environment = dict.fromkeys(names, str(threads))
-    loggers = (
-        "distributed",
-        "distributed.client",
-        "distributed.worker",
-        "distributed.scheduler",
-        "tornado",
-    )
+    parts = ("client", "worker", "scheduler")
+    loggers = ("distributed", *(f"distributed.{part}" for part in parts), "tornado")
     settings: dict[str, Any] = {
         "distributed.nanny.pre-spawn-environ": environment,
         # No data for a dashboard, which cost processor time and an hour of memory
@@ -146,9 +141,7 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
                 dashboard_address="127.0.0.1:0",
                 silence_logs=logging.CRITICAL,
             )
-        except (
-            RuntimeError
-        ) as error:  # raised by Dask; its cause may be an error of the operating system
+        except RuntimeError as error:  # its cause may be an error of the operating system
             cause: BaseException | None = error
             while cause is not None and not isinstance(cause, OSError):
                 cause = cause.__cause__
@@ -219,10 +212,8 @@ class Work:
         """Prepare this worker. Raises UsageError or InputError if it is incompatible with the
         command.
         """
-        for (package, expected), found in zip(
-            self.versions.items(), _versions().values(), strict=True
-        ):
-            if found != expected:
+        for package, found in _versions().items():
+            if found != (expected := self.versions[package]):
                 raise UsageError(
                     f"found {package} {found}, expected {expected} as on this machine",
                     hint=SAME_VERSIONS,

@@ -36,7 +36,7 @@ from splinecli.records.output_files import (
     SURFACE_REPORT,
     file_names,
 )
-from splinecli.results.files import UnfinishedError, read_report
+from splinecli.results.files import UNUSABLE, UnfinishedError, read_report
 from splinecli.surface import surface_files
 from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.make import SurfaceSettings, make_surface
@@ -223,7 +223,7 @@ def _find_normal_map(folder: Path) -> Path:
         problem = f"the folder has no normal map ({', '.join(names)})"
     except UnfinishedError as error:
         problem = f"the folder has no whole results of infer: it {error}"
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except UNUSABLE:
         problem = f"the folder has no whole results of infer: its {REPORT} is damaged"
     raise InputError(
         problem, path=folder, hint="Give a folder that 'splinecli infer' wrote, or one of its files"
@@ -238,9 +238,9 @@ def _report_of(path: Path) -> dict[str, Any] | None:
         report: dict[str, Any] = read_json(path.parent / REPORT)
         if path.name not in report["files"]:
             return None
-    except (OSError, ValueError, KeyError, TypeError):
+    except UNUSABLE:
         return None
-    with suppress(ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
+    with suppress(*UNUSABLE, OverflowError, SplinecliError):
         camera_matrix, _ = view_of_report(report)
         if camera_matrix is not None:
             ray_basis(camera_matrix)

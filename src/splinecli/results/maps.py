@@ -60,10 +60,8 @@ def map_files(
     for part in row.parts:
         channels = values[..., part.first : part.last]
         if part.has_values:
-            yield (
-                f"{part.name}.npy",
-                np.squeeze(channels, 2) if channels.shape[2] == 1 else channels,
-            )
+            single = channels.shape[2] == 1
+            yield f"{part.name}.npy", channels[..., 0] if single else channels
         yield f"{part.name}.png", encode_png(MAP_FUNCTIONS[part.name].picture(channels, mask))
     scale = row.scale if scale is None else scale
     for suffix, name in row.files.items():
@@ -72,11 +70,8 @@ def map_files(
         elif suffix == "tiff" and suffix in formats:
             yield name, encode_tiff(values, row.unit)
         elif suffix == "exr" and suffix in formats:
-            largest = np.finfo(np.float16).max
-            yield (
-                name,
-                encode_exr(values.clip(0, largest).astype(np.float16), {"colours": row.unit}),
-            )
+            colours = values.clip(0, np.finfo(np.float16).max).astype(np.float16)
+            yield name, encode_exr(colours, {"colours": row.unit})
         elif suffix == "png":
             texts = {row.name: row.scale_text.format(scale=scale)} if row.scale_text else None
             yield name, encode_png(map_picture(row, values, mask, scale), texts)

@@ -62,14 +62,9 @@ def material(source: CaptureSource, estimate: NormalEstimate, progress: Progress
     normals = take_pixels(estimate.normal_map, estimate.capture.mask)
     found = material_of(estimate, colours_of_surface(source, estimate.capture, normals, progress))
     maps = np.zeros((*estimate.capture.mask.shape, 7), np.float32)
-    columns = (
-        found.base_colour,
-        found.roughness,
-        found.metalness,
-        found.specular,
-        found.confidence,
+    maps[estimate.capture.mask] = np.column_stack(
+        (found.base_colour, found.roughness, found.metalness, found.specular, found.confidence)
     )
-    maps[estimate.capture.mask] = np.column_stack(columns)
     return maps
 
 

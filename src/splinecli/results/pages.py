@@ -7,6 +7,7 @@ from __future__ import annotations
 import base64
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
@@ -92,9 +93,8 @@ def result_page(
     maps = dict(zip(("high", "low"), split_normals(unit(normals), shown), strict=True))
     error_png, exposure, captions = None, 0.0, {name: MAPS[name].caption for name in values}
     for name, whole in values.items():
-        reduced = _reduce(np.atleast_3d(whole), mask, LARGEST_MAP)[0].reshape(
-            *shown.shape, *whole.shape[2:]
-        )
+        reduced, _ = _reduce(np.atleast_3d(whole), mask, LARGEST_MAP)
+        reduced = reduced.reshape(*shown.shape, *whole.shape[2:])
         maps[name] = map_picture(MAPS[name], reduced, shown)
     if material is not None:
         maps |= page_pictures(_reduce(material, mask, LARGEST_MAP)[0])
@@ -102,9 +102,8 @@ def result_page(
         bright = float(np.quantile(material[mask][:, :3].max(axis=1), 0.99))  # is shown as white
         exposure = round(float(-np.log2(np.clip(bright, 1 / 16, 16))), 1)
     if error_map_deg is not None:
-        values_deg, known = _reduce(
-            error_map_deg[..., None], np.isfinite(error_map_deg), LARGEST_MAP
-        )
+        known = np.isfinite(error_map_deg)
+        values_deg, known = _reduce(error_map_deg[..., None], known, LARGEST_MAP)
         error_png = _data_url(colour_errors(np.where(known, values_deg[..., 0], np.nan)))
     first = _first_pictures(maps, normals, shown) if shown.size > 500_000 else {}
     (height, width), size = shown.shape, _size(shown)
@@ -122,9 +121,8 @@ def result_page(
         title=report["capture"],
         report=report,
         facts=_facts(report, size if is_reduced else None),
-        reduced=(
-            f"This page shows {size} of the {_size(mask)} pixels. The other files have all pixels."
-        )
+        reduced=f"This page shows {size} of the {_size(mask)} pixels. The other files have all"
+        " pixels."
         if is_reduced
         else None,
         unit="pixels" if millimetres is None else "mm",
@@ -190,9 +188,7 @@ def _reduce(values: Float32Array, known: Bools, largest: int) -> tuple[Float32Ar
     weight = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)[..., None]
     # OpenCV takes up to four
     channels = (np.where(known, channel, 0) for channel in np.moveaxis(values, 2, 0))
-    total = np.dstack(
-        [cv2.resize(channel, size, interpolation=cv2.INTER_AREA) for channel in channels]
-    )
+    total = np.dstack([cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in channels])
     return np.divide(total, weight, out=np.zeros_like(total), where=weight > 0), weight[..., 0] > 0
 
 
@@ -209,21 +205,21 @@ def _facts(report: Mapping[str, Any], reduced: str | None) -> list[tuple[str, st
     # up to this page
     stages = [(name, n) for name, n in report["seconds"].items() if n >= 0.05 and name != "total"]
     condition = "" if report["capture_judged"] else ", if the lights and the images are right"
-    return [
+    facts = [
         ("Method", report["method"]),
-        *([] if weights is None else [("Weights", weights["name"])]),
+        ("Weights", weights and weights["name"]),
         ("Lights", str(report["n_lights"])),
         ("Pixels", f"{report['n_pixels']:,}"),
         ("Size", _TIMES.join(map(str, report["image_size"]))),
-        *(
-            []
-            if expected is None
-            else [("Likely within 5°", f"{expected:.0%} of the pixels{condition}")]
+        (
+            "Likely within 5°",
+            None if expected is None else f"{expected:.0%} of the pixels{condition}",
         ),
-        *([] if reduced is None else [("Size on this page", reduced)]),
+        ("Size on this page", reduced),
         ("Seconds", ", ".join(f"{name.replace('_', ' ')} {n:.1f}" for name, n in stages)),
         ("Device", f"{report['device']}, {report['precision']}"),
     ]
+    return [(term, value) for term, value in facts if value is not None]
 
 
 def _data_url(picture: Picture) -> str:
@@ -265,25 +261,19 @@ class Entry(NamedTuple):
         """
         if "error" in report:
             return cls(Row(report["capture"], error=report["error"]))
-        errors, expected, seconds = (
-            report["angular_error_deg"],
-            report["expected_under_5"],
-            report["seconds"],
-        )
+        errors, expected = report["angular_error_deg"], report["expected_under_5"]
+        seconds, warnings = report["seconds"], report["warnings"]
         row = Row(
             report["capture"],
             lights=str(report["n_lights"]),
             pixels=f"{report['n_pixels']:,}",
             mae="" if errors is None else f"{errors['mean']:.2f}°",
             likely="" if expected is None else f"{expected:.0%}",
-            warnings=str(len(report["warnings"]) or ""),
+            warnings=str(len(warnings) or ""),
             seconds=f"{seconds.get('total', sum(seconds.values())):.1f}",
         )
-        return cls(
-            row,
-            tuple(report["files"]),
-            tuple(str(warning["text"]) for warning in report["warnings"]),
-        )
+        words = tuple(str(warning["text"]) for warning in warnings)
+        return cls(row, tuple(report["files"]), words)
 
 
 def index_page(entries: Sequence[Entry], output: Path) -> str:
@@ -295,18 +285,14 @@ def index_page(entries: Sequence[Entry], output: Path) -> str:
         # Quote the bytes, because a folder's name may not be valid text.
         folder = quote(os.fsencode(row.capture))
         picture = next((name for name in (NORMALS["png8"], NORMALS["png"]) if name in files), None)
-        rows.append(
-            {
-                **row._asdict(),
-                "page": f"{folder}/{PAGE}" if PAGE in files else None,
-                "picture": None if picture is None else f"{folder}/{picture}",
-                "thumbnail": None
-                if picture is None
-                else _thumbnail(output / row.capture / picture),
-                "words": words,
-                "files": [(name, f"{folder}/{quote(name)}") for name in files],
-            }
-        )
+        shown = {**row._asdict(), "words": words, "page": None, "picture": None, "thumbnail": None}
+        shown["files"] = [(name, f"{folder}/{quote(name)}") for name in files]
+        if PAGE in files:
+            shown["page"] = f"{folder}/{PAGE}"
+        if picture is not None:
+            shown["picture"] = f"{folder}/{picture}"
+            shown["thumbnail"] = _thumbnail(output / row.capture / picture)
+        rows.append(shown)
     return render("index.html", title=f"{len(entries)} captures", header=HEADER, rows=rows)
 
 
@@ -357,14 +343,12 @@ def with_earlier(entries: Sequence[Entry], folder: Path) -> list[Entry]:
 
 def has_index(folder: Path) -> bool:
     """Return whether the folder has an index.html that splinecli wrote."""
-    try:
-        if not (folder / INDEX).is_file():
-            return False
-        with (folder / INDEX).open("rb") as file:
-            # it is near the top
-            return b'<meta name="generator" content="splinecli">' in file.read(1 << 16)
-    except OSError:
-        return False
+    with suppress(OSError):
+        if (folder / INDEX).is_file():
+            with (folder / INDEX).open("rb") as file:
+                # it is near the top
+                return b'<meta name="generator" content="splinecli">' in file.read(1 << 16)
+    return False
 
 
 def check_index_free(folder: Path, *, overwrite: bool) -> None:
