@@ -2,7 +2,7 @@
 to JSON.
 """
 
-# The options form a table: name, type, panel and kind of value, then the help text.
+# The options form a table: name and type, then panel, help text and kind of value.
 from __future__ import annotations
 
 import json
@@ -13,7 +13,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
-from msgspec import Meta
+from msgspec import NODEFAULT, Meta
 
 from splinecli.capture import CaptureSource, RadiometricCalibration, open_capture
 from splinecli.capture.files import check_not_empty, list_images
@@ -37,7 +37,16 @@ from splinecli.maths.normals import Convention
 from splinecli.maths.robust import MIN_LIGHTS
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.records import base as records
-from splinecli.records.base import FileName, NotNegative, Option, Positive, Record, Seed
+from splinecli.records.base import (
+    FileName,
+    NotNegative,
+    Option,
+    Positive,
+    Record,
+    Seed,
+    flag,
+    option,
+)
 from splinecli.records.output_files import MAPS, NORMALS
 from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.surface_files import check_exr
@@ -115,10 +124,9 @@ Update = Annotated[
 class Display(Record, frozen=True, kw_only=True):
     """The output that a command prints."""
 
-    as_json: Annotated[
-        bool,
-        Option("Output", "Print one JSON document on stdout, and nothing else.", names="--json"),
-    ] = False
+    as_json: bool = flag(
+        "Output", "Print one JSON document on stdout, and nothing else.", names="--json"
+    )
     quiet: Quiet = False
 
 
@@ -134,16 +142,14 @@ class Workers(Record, frozen=True, kw_only=True):
     machine can use.
     """
 
-    workers: Annotated[
-        int,
-        Option(
-            "Processes and machines",
-            "Number of parallel processes on this machine (needs the extra 'cluster'). auto"
-            " chooses by cores and memory.",
-            "N|auto",
-            parse=parse_workers,
-        ),
-    ] = 1
+    workers: int = option(
+        "Processes and machines",
+        "Number of parallel processes on this machine (needs the extra 'cluster'). auto"
+        " chooses by cores and memory.",
+        "N|auto",
+        value=1,
+        parse=parse_workers,
+    )
 
 
 class ClusterOptions(Workers, frozen=True, kw_only=True):
@@ -152,16 +158,13 @@ class ClusterOptions(Workers, frozen=True, kw_only=True):
     """
 
     # the address or the scheduler file of a Dask scheduler
-    address: Annotated[
-        str | None,
-        Option(
-            "Processes and machines",
-            "Compute on the workers of a running Dask cluster: the address of its scheduler, or"
-            " its scheduler file (needs the extra 'cluster').",
-            "ADDRESS|FILE",
-            names="--cluster",
-        ),
-    ] = None
+    address: str | None = option(
+        "Processes and machines",
+        "Compute on the workers of a running Dask cluster: the address of its scheduler, or"
+        " its scheduler file (needs the extra 'cluster').",
+        "ADDRESS|FILE",
+        names="--cluster",
+    )
     gpu: bool = False  # whether only workers with the Dask resource GPU are used
 
     CONFLICTS = (("workers", "address", "Leave --workers out: the cluster has workers of its own"),)
@@ -189,180 +192,116 @@ class Reading(Record, frozen=True, kw_only=True):
     The help describes each option. None stands for the default given there. Raises UsageError.
     """
 
-    mask: Annotated[
-        FileName | None,
-        Option("Input", MASK_IMAGE.format("object"), "FILE", "a file named mask.*, or all pixels"),
-    ] = None
-    crop: Annotated[
-        str | None,
-        Option(
-            "Input",
-            "Read this box of the images: upper left corner and size, in pixels.",
-            "X,Y,W,H",
-        ),
-    ] = None
-    scale: Annotated[
-        str | None,
-        Option("Input", "Read every N-th row and column, for a first look.", "1/N", "all"),
-    ] = None
-    align: Annotated[
-        bool,
-        Option(
-            "Input",
-            "Align the images to the first one, if they were shifted, rotated or zoomed between"
-            " exposures.",
-        ),
-    ] = False
-    ground_truth: Annotated[
-        FileName | None,
-        Option("Input", "True normals to compare with (.mat, .npy, text, PNG, TIFF).", "FILE"),
-    ] = None
-    transfer: Annotated[
-        str,
-        Option(
-            "Input",
-            "Transfer curve of the images: auto, linear, srgb or gamma:G. auto follows the files,"
-            " and reads JPEG as sRGB.",
-            "CURVE",
-            complete=CURVES,
-        ),
-    ] = AUTOMATIC
-    ambient: Annotated[
-        FileName | None,
-        Option(
-            "Input",
-            "Image taken without the lights, to subtract from all images.",
-            "FILE",
-            "ambient.*",
-        ),
-    ] = None
-    flat_field: Annotated[
-        FileName | None,
-        Option(
-            "Input",
-            "Folder with images of a uniform white surface: one for all lights, or one for each"
-            " light.",
-            "DIR",
-        ),
-    ] = None
+    mask: FileName | None = option(
+        "Input", MASK_IMAGE.format("object"), "FILE", "a file named mask.*, or all pixels"
+    )
+    crop: str | None = option(
+        "Input", "Read this box of the images: upper left corner and size, in pixels.", "X,Y,W,H"
+    )
+    scale: str | None = option(
+        "Input", "Read every N-th row and column, for a first look.", "1/N", "all"
+    )
+    align: bool = flag(
+        "Input",
+        "Align the images to the first one, if they were shifted, rotated or zoomed between"
+        " exposures.",
+    )
+    ground_truth: FileName | None = option(
+        "Input", "True normals to compare with (.mat, .npy, text, PNG, TIFF).", "FILE"
+    )
+    transfer: str = option(
+        "Input",
+        "Transfer curve of the images: auto, linear, srgb or gamma:G. auto follows the files,"
+        " and reads JPEG as sRGB.",
+        "CURVE",
+        value=AUTOMATIC,
+        complete=CURVES,
+    )
+    ambient: FileName | None = option(
+        "Input", "Image taken without the lights, to subtract from all images.", "FILE", "ambient.*"
+    )
+    flat_field: FileName | None = option(
+        "Input",
+        "Folder with images of a uniform white surface: one for all lights, or one for each light.",
+        "DIR",
+    )
     white_level: WhiteLevel = None
-    lights: Annotated[
-        FileName | None,
-        Option(
-            "Lights",
-            f"Light directions ({light_suffixes()}): x y z for each image, z to the camera."
-            " estimate derives them from the images, less accurately than a calibration.",
-            "FILE|estimate",
-            "the light file in CAPTURE",
-        ),
-    ] = None
-    first_light: Annotated[
-        str | None,
-        Option(
-            "Lights",
-            "With --lights estimate: the side that the first light comes from, such as left, above"
-            " or upper-left, or its azimuth, counter-clockwise from the right. Needed if the"
-            " images show no outline of the object.",
-            "SIDE|DEGREES",
-            complete=tuple(SIDES_DEG),
-        ),
-    ] = None
-    light_frame: Annotated[
-        str | None,
-        Option(
-            "Lights",
-            f"Frame of the light file: any of x-left, y-down, z-away and {EXCHANGED} (y comes"
-            " before x).",
-            "LIST",
-            "x right, y up, z to the camera",
-            complete=records.complete_list(("x-left", "y-down", "z-away", EXCHANGED)),
-        ),
-    ] = None
-    light_format: Annotated[
-        LightForm,
-        Option(
-            "Lights",
-            "Form of a light in a text file: xyz, a vector; azel, azimuth and elevation; or"
-            " slant-tilt, the angles of HALCON. Angles are in degrees.",
-        ),
-    ] = "xyz"
-    intensities: Annotated[
-        FileName | None,
-        Option(
-            "Lights",
-            "Light intensities: a line r g b for each image.",
-            "FILE|equal",
-            "equal, or estimated if the images show that they differ",
-        ),
-    ] = None
-    lights_in_channels: Annotated[
-        bool,
-        Option(
-            "Lights",
-            "The channels of each colour image are photographs under three coloured lamps; the"
-            " light file has three lights for each image, in the order R, G, B. For gray objects.",
-        ),
-    ] = False
-    crosstalk: Annotated[
-        FileName | None,
-        Option(
-            "Lights",
-            "With --lights-in-channels: 3 x 3 responses to the lamps, one line for each of the"
-            " channels R, G, B.",
-            "FILE",
-            "crosstalk.txt in CAPTURE, or none",
-        ),
-    ] = None
-    light_positions: Annotated[
-        FileName | None,
-        Option(
-            "Lights",
-            "Near lamps: a line x y z for each image, in any unit, from the middle of the image.",
-            "FILE",
-            "light_positions.txt in CAPTURE",
-        ),
-    ] = None
-    light_distance: Annotated[
-        Positive | None,
-        Option(
-            "Lights", "Near lamps: the distance of all lamps from the middle of the object.", "D"
-        ),
-    ] = None
-    pixel_size: Annotated[
-        Positive | None,
-        Option(
-            "Lights",
-            "Near lamps: the width of a pixel on the object.",
-            "S",
-            "pixel_size.txt in CAPTURE",
-        ),
-    ] = None
-    object_width: Annotated[
-        Positive | None,
-        Option(
-            "Lights",
-            "Near lamps: the width of the object in its mask, instead of --pixel-size.",
-            "W",
-        ),
-    ] = None
-    camera_matrix: Annotated[
-        FileName | None,
-        Option(
-            "Lights",
-            "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera: each pixel"
-            " is then estimated in the frame of its viewing ray.",
-            "FILE",
-            "camera_matrix.txt in CAPTURE, or orthographic",
-        ),
-    ] = None
-    strict: Annotated[
-        bool,
-        Option(
-            "Output",
-            "Fail with exit code 3 if the lights or the images are probably wrong, instead of"
-            " warning.",
-        ),
-    ] = False
+    lights: FileName | None = option(
+        "Lights",
+        f"Light directions ({light_suffixes()}): x y z for each image, z to the camera."
+        " estimate derives them from the images, less accurately than a calibration.",
+        "FILE|estimate",
+        "the light file in CAPTURE",
+    )
+    first_light: str | None = option(
+        "Lights",
+        "With --lights estimate: the side that the first light comes from, such as left, above"
+        " or upper-left, or its azimuth, counter-clockwise from the right. Needed if the"
+        " images show no outline of the object.",
+        "SIDE|DEGREES",
+        complete=tuple(SIDES_DEG),
+    )
+    light_frame: str | None = option(
+        "Lights",
+        f"Frame of the light file: any of x-left, y-down, z-away and {EXCHANGED} (y comes"
+        " before x).",
+        "LIST",
+        "x right, y up, z to the camera",
+        complete=records.complete_list(("x-left", "y-down", "z-away", EXCHANGED)),
+    )
+    light_format: LightForm = option(
+        "Lights",
+        "Form of a light in a text file: xyz, a vector; azel, azimuth and elevation; or"
+        " slant-tilt, the angles of HALCON. Angles are in degrees.",
+        value="xyz",
+    )
+    intensities: FileName | None = option(
+        "Lights",
+        "Light intensities: a line r g b for each image.",
+        "FILE|equal",
+        "equal, or estimated if the images show that they differ",
+    )
+    lights_in_channels: bool = flag(
+        "Lights",
+        "The channels of each colour image are photographs under three coloured lamps; the"
+        " light file has three lights for each image, in the order R, G, B. For gray objects.",
+    )
+    crosstalk: FileName | None = option(
+        "Lights",
+        "With --lights-in-channels: 3 x 3 responses to the lamps, one line for each of the"
+        " channels R, G, B.",
+        "FILE",
+        "crosstalk.txt in CAPTURE, or none",
+    )
+    light_positions: FileName | None = option(
+        "Lights",
+        "Near lamps: a line x y z for each image, in any unit, from the middle of the image.",
+        "FILE",
+        "light_positions.txt in CAPTURE",
+    )
+    light_distance: Positive | None = option(
+        "Lights", "Near lamps: the distance of all lamps from the middle of the object.", "D"
+    )
+    pixel_size: Positive | None = option(
+        "Lights",
+        "Near lamps: the width of a pixel on the object.",
+        "S",
+        "pixel_size.txt in CAPTURE",
+    )
+    object_width: Positive | None = option(
+        "Lights", "Near lamps: the width of the object in its mask, instead of --pixel-size.", "W"
+    )
+    camera_matrix: FileName | None = option(
+        "Lights",
+        "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera: each pixel"
+        " is then estimated in the frame of its viewing ray.",
+        "FILE",
+        "camera_matrix.txt in CAPTURE, or orthographic",
+    )
+    strict: bool = flag(
+        "Output",
+        "Fail with exit code 3 if the lights or the images are probably wrong, instead of warning.",
+    )
     # whether a surface, in the unit of pixel_size, is also computed; a field of InferOptions
     surface = False
 
@@ -372,7 +311,7 @@ class Reading(Record, frozen=True, kw_only=True):
         super().__post_init__()
         # These options apply to near lamps or to a light file.
         near, of_file = "finds distant lights", "needs no light file"
-        for option, given, reason in (
+        for name, given, reason in (
             ("--light-positions", self.light_positions is not None, near),
             ("--light-distance", self.light_distance is not None, near),
             ("--light-frame", self.light_frame is not None, of_file),
@@ -380,8 +319,8 @@ class Reading(Record, frozen=True, kw_only=True):
         ):
             if self.finds_lights and given:
                 raise UsageError(
-                    f"--lights estimate {reason}, so it contradicts {option}",
-                    hint=f"Leave {option} out, or give a light file",
+                    f"--lights estimate {reason}, so it contradicts {name}",
+                    hint=f"Leave {name} out, or give a light file",
                 )
         add_it = "Add it, or leave both out"
         if self.crosstalk is not None and not self.lights_in_channels:
@@ -472,6 +411,16 @@ class Reading(Record, frozen=True, kw_only=True):
         )
 
 
+def parse_indices(text: str, title: str) -> tuple[int, ...]:
+    """Return the integers in a text such as "0,5,12". Raises UsageError."""
+    try:
+        return tuple(int(item) for item in text.split(","))
+    except ValueError:
+        raise UsageError(
+            f"{title} is {text!r}; expected zero-based numbers such as 0,5,12"
+        ) from None
+
+
 class InferOptions(Reading, frozen=True, kw_only=True):
     """The options of `infer`; see its help. Raises UsageError if a value is invalid or two options
     conflict.
@@ -479,102 +428,78 @@ class InferOptions(Reading, frozen=True, kw_only=True):
 
     # The defaults follow. light_indices are zero-based. map_scales are names of maps and the values
     # shown as white, if they are not those of the rows in MAPS.
-    auto_mask: Annotated[
-        bool,
-        Option(
-            "Input", "If there is no mask, find the object in the images and write found_mask.png."
-        ),
-    ] = False
+    auto_mask: bool = flag(
+        "Input", "If there is no mask, find the object in the images and write found_mask.png."
+    )
     as_stored: AsStored = False
     refine_lights: RefineLights = False
-    pixel_size: Annotated[
-        Positive | None,
-        Option(
-            "Lights",
-            "Near lamps: the width of a pixel on the object, in the unit of the lamps. With"
-            " --surface: in millimetres, for a surface in millimetres.",
-            "S",
-            "pixel_size.txt in CAPTURE",
-        ),
-    ] = None
-    n_lights: Annotated[
-        Annotated[int, Meta(ge=MIN_LIGHTS)] | None,
-        Option("Lights", "Use K lights drawn at random.", "K", "all"),
-    ] = None
+    pixel_size: Positive | None = option(
+        "Lights",
+        "Near lamps: the width of a pixel on the object, in the unit of the lamps. With"
+        " --surface: in millimetres, for a surface in millimetres.",
+        "S",
+        "pixel_size.txt in CAPTURE",
+    )
+    n_lights: Annotated[int, Meta(ge=MIN_LIGHTS)] | None = option(
+        "Lights", "Use K lights drawn at random.", "K", "all"
+    )
     seed: RandomSeed = 0
-    light_indices: Annotated[
-        tuple[int, ...] | None,
-        Option(
-            "Lights",
-            "Use these lights, counted from 0. Plots and warnings count from 1.",
-            "I,J,...",
-            parse=partial(parse_indices, option="--light-indices"),
-        ),
-    ] = None
-    method: Annotated[
-        str,
-        Option(
-            "Method",
-            f"Method to use: {records.listed(method_names())}.",
-            "METHOD",
-            complete=method_names(),
-        ),
-    ] = DEFAULT_METHOD
+    light_indices: tuple[int, ...] | None = option(
+        "Lights",
+        "Use these lights, counted from 0. Plots and warnings count from 1.",
+        "I,J,...",
+        parse=partial(parse_indices, title="--light-indices"),
+    )
+    method: str = option(
+        "Method",
+        f"Method to use: {records.listed(method_names())}.",
+        "METHOD",
+        value=DEFAULT_METHOD,
+        complete=method_names(),
+    )
     weights: Weights = None
-    distil: Annotated[
-        bool | None,
-        Option(
-            "Speed",
-            "Approximate the network with a smaller one, trained on a sample of the capture's"
-            " pixels, or use the method on every pixel.",
-            default="--distil from 100,000 pixels, else --exact",
-            names="--distil/--exact",
-        ),
-    ] = None
+    distil: bool | None = option(
+        "Speed",
+        "Approximate the network with a smaller one, trained on a sample of the capture's"
+        " pixels, or use the method on every pixel.",
+        default="--distil from 100,000 pixels, else --exact",
+        names="--distil/--exact",
+    )
     device: DeviceName = "auto"
     precision: PrecisionName = "auto"
-    output: Annotated[
-        FileName, Option("Output", "Write results to OUT/<capture name>/.", "OUT", names=OUTPUT)
-    ] = "out"
-    formats: Annotated[
-        tuple[str, ...],
-        Option(
-            "Output",
-            f"Files of the normal map: any of {records.listed(NORMALS)}. png has 16 bits, png8 has"
-            " 8, npy and tiff are float32. With exr (needs the extra 'exr'), albedo and depth are"
-            " written as EXR, too.",
-            "LIST",
-            names="--format",
-            items=NORMALS,
-        ),
-    ] = ("png", "npy")
-    maps: Annotated[
-        tuple[str, ...],
-        Option(
-            "Output",
-            f"Further maps to write: any of {records.listed(MAPS)}. preview is a shaded image."
-            " relief:2 makes heights of 2 pixels white in the picture, and curvature:0.1 a mean"
-            " curvature of 0.1 per pixel.",
-            "LIST",
-            items=MAPS,
-        ),
-    ] = ()
+    output: FileName = option(
+        "Output", "Write results to OUT/<capture name>/.", "OUT", value="out", names=OUTPUT
+    )
+    formats: tuple[str, ...] = option(
+        "Output",
+        f"Files of the normal map: any of {records.listed(NORMALS)}. png has 16 bits, png8 has"
+        " 8, npy and tiff are float32. With exr (needs the extra 'exr'), albedo and depth are"
+        " written as EXR, too.",
+        "LIST",
+        value=("png", "npy"),
+        names="--format",
+        items=NORMALS,
+    )
+    maps: tuple[str, ...] = option(
+        "Output",
+        f"Further maps to write: any of {records.listed(MAPS)}. preview is a shaded image."
+        " relief:2 makes heights of 2 pixels white in the picture, and curvature:0.1 a mean"
+        " curvature of 0.1 per pixel.",
+        "LIST",
+        value=(),
+        items=MAPS,
+    )
     map_scales: tuple[tuple[str, Positive], ...] = ()
-    html: Annotated[
-        bool, Option("Output", "Also write page.html for interactive relighting, with all maps.")
-    ] = False
-    surface: Annotated[
-        bool,
-        Option(
-            "Output",
-            "Also write mesh.glb, mesh.ply, and depth.npy, .tiff and .png, as integrate does.",
-        ),
-    ] = False
-    discontinuity: Annotated[NotNegative, Option("Output", DISCONTINUITY_HELP, "K")] = DISCONTINUITY
-    convention: Annotated[
-        Convention,
-        Option("Output", "Green channel of the PNG files: opengl is y up, directx is y down."),
-    ] = "opengl"
+    html: bool = flag("Output", "Also write page.html for interactive relighting, with all maps.")
+    surface: bool = flag(
+        "Output", "Also write mesh.glb, mesh.ply, and depth.npy, .tiff and .png, as integrate does."
+    )
+    discontinuity: NotNegative = option("Output", DISCONTINUITY_HELP, "K", value=DISCONTINUITY)
+    convention: Convention = option(
+        "Output",
+        "Green channel of the PNG files: opengl is y up, directx is y down.",
+        value="opengl",
+    )
 
     CONFLICTS = (
         *Reading.CONFLICTS,
@@ -586,9 +511,9 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         super().__post_init__()
         count = self.n_lights if self.light_indices is None else len(self.light_indices)
         if self.align and count is not None and count < MIN_IMAGES:
-            option = "--n-lights" if self.light_indices is None else "--light-indices"
+            name = "--n-lights" if self.light_indices is None else "--light-indices"
             raise UsageError(
-                f"{option} leaves {count} images, but --align needs at least {MIN_IMAGES}",
+                f"{name} leaves {count} images, but --align needs at least {MIN_IMAGES}",
                 hint="Use more lights, or leave --align out",
             )
         if self.finds_lights and self.refine_lights:
@@ -629,8 +554,8 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         found = {}
         for name, kind in records.field_types(type(self)).items():
             if name not in ("output", "device") and getattr(self, name) != getattr(earlier, name):
-                option = records.option_of(kind)
-                found[records.long_name(name, option) if option else "--maps"] = True
+                given = records.option_of(kind)
+                found[records.long_name(name, given) if given else "--maps"] = True
         return list(found)
 
     @property
@@ -651,16 +576,6 @@ def check_pixel_size(pixel_size: float) -> None:
     if not SMALLEST_PIXEL_MM <= pixel_size <= LARGEST_PIXEL_MM:
         expected = f"{SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g}"
         raise UsageError(f"the pixel size is {pixel_size:g} mm, expected {expected}")
-
-
-def parse_indices(text: str, option: str) -> tuple[int, ...]:
-    """Return the integers in a text such as "0,5,12". Raises UsageError."""
-    try:
-        return tuple(int(item) for item in text.split(","))
-    except ValueError:
-        raise UsageError(
-            f"{option} is {text!r}; expected zero-based numbers such as 0,5,12"
-        ) from None
 
 
 class Shard(NamedTuple):
@@ -691,37 +606,28 @@ class BatchOptions(Record, frozen=True, kw_only=True):
     and the printed output.
     """
 
-    captures: Annotated[
-        tuple[Path, ...],
-        Option("Arguments", "Folders with the images of one object each, or films.", "CAPTURE"),
-    ]
-    shard: Annotated[
-        Shard | None,
-        Option(
-            "Processes and machines",
-            "Process shard I of N: captures I, I+N, I+2N, ...",
-            "I/N",
-            parse=Shard.parse,
-        ),
-    ] = None
+    captures: tuple[Path, ...] = option(
+        "Arguments",
+        "Folders with the images of one object each, or films.",
+        "CAPTURE",
+        value=NODEFAULT,
+    )
+    shard: Shard | None = option(
+        "Processes and machines",
+        "Process shard I of N: captures I, I+N, I+2N, ...",
+        "I/N",
+        parse=Shard.parse,
+    )
     update: Update = False
     overwrite: Overwrite = False
-    as_json: Annotated[
-        bool,
-        Option(
-            "Output",
-            "Print a JSON list of the reports on stdout, and nothing else.",
-            names="--json",
-        ),
-    ] = False
-    as_json_lines: Annotated[
-        bool,
-        Option(
-            "Output",
-            "Print each report as one line of JSON on stdout as soon as its capture is done.",
-            names="--jsonl",
-        ),
-    ] = False
+    as_json: bool = flag(
+        "Output", "Print a JSON list of the reports on stdout, and nothing else.", names="--json"
+    )
+    as_json_lines: bool = flag(
+        "Output",
+        "Print each report as one line of JSON on stdout as soon as its capture is done.",
+        names="--jsonl",
+    )
     quiet: Quiet = False
 
     CONFLICTS = (("as_json", "as_json_lines", LEAVE_ONE), ("overwrite", "update", LEAVE_ONE))
@@ -735,63 +641,43 @@ class BatchOptions(Record, frozen=True, kw_only=True):
 class WatchOptions(Record, frozen=True, kw_only=True):
     """The options of `watch`; see its help."""
 
-    folder: Annotated[
-        Path,
-        Option(
-            "Arguments", "Folder in which captures arrive, each as a subfolder or a film.", "FOLDER"
-        ),
-    ]
-    options: Annotated[
-        tuple[str, ...], Option("Arguments", "Options of infer, after two dashes.", "-- OPTIONS")
-    ] = ()
-    marker: Annotated[
-        str | None,
-        Option(
-            "Captures",
-            "File that appears in a subfolder when it is complete.",
-            "NAME",
-            "see --settle",
-        ),
-    ] = None
-    settle: Annotated[
-        NotNegative,
-        Option(
-            "Captures",
-            "A film, or a subfolder without --marker, is complete when it has not changed for this"
-            " long.",
-            "SECONDS",
-        ),
-    ] = 5.0
+    folder: Path = option(
+        "Arguments",
+        "Folder in which captures arrive, each as a subfolder or a film.",
+        "FOLDER",
+        value=NODEFAULT,
+    )
+    options: tuple[str, ...] = option(
+        "Arguments", "Options of infer, after two dashes.", "-- OPTIONS", value=()
+    )
+    marker: str | None = option(
+        "Captures", "File that appears in a subfolder when it is complete.", "NAME", "see --settle"
+    )
+    settle: NotNegative = option(
+        "Captures",
+        "A film, or a subfolder without --marker, is complete when it has not changed for this"
+        " long.",
+        "SECONDS",
+        value=5.0,
+    )
 
 
 class InfoOptions(Display, frozen=True, kw_only=True):
     """The options of `info` in addition to Reading; see its help."""
 
-    capture: Annotated[
-        Path, Option("Arguments", "Folder with the images of one object, or a film.", "CAPTURE")
-    ]
-    auto_mask: Annotated[
-        bool, Option("Input", "If there is no mask, find the object in the images.")
-    ] = False
-    check_lights: Annotated[
-        bool,
-        Option(
-            "Lights",
-            "List other readings of the light file, and how well each of them fits the images.",
-        ),
-    ] = False
-    mended_lights: Annotated[
-        Path | None,
-        Option(
-            "Lights",
-            "If the light directions fit the images better in another order or frame, write them"
-            " in it.",
-            "FILE",
-        ),
-    ] = None
-    plot: Annotated[
-        Path | None, Option("Output", "Also plot the light directions to a PNG file.", "FILE")
-    ] = None
-    overwrite: Annotated[bool, Option("Output", "Replace an earlier plot or file of lights.")] = (
-        False
+    capture: Path = option(
+        "Arguments", "Folder with the images of one object, or a film.", "CAPTURE", value=NODEFAULT
     )
+    auto_mask: bool = flag("Input", "If there is no mask, find the object in the images.")
+    check_lights: bool = flag(
+        "Lights",
+        "List other readings of the light file, and how well each of them fits the images.",
+    )
+    mended_lights: Path | None = option(
+        "Lights",
+        "If the light directions fit the images better in another order or frame, write them"
+        " in it.",
+        "FILE",
+    )
+    plot: Path | None = option("Output", "Also plot the light directions to a PNG file.", "FILE")
+    overwrite: bool = flag("Output", "Replace an earlier plot or file of lights.")

@@ -2,7 +2,7 @@
 help.
 """
 
-# The options form a table: name, type, panel and kind of value, then the help text.
+# The options form a table: name and type, then panel, help text and kind of value.
 from __future__ import annotations
 
 from contextlib import suppress
@@ -10,7 +10,7 @@ from itertools import chain, product
 from pathlib import Path
 from typing import Annotated
 
-from msgspec import Meta
+from msgspec import NODEFAULT, Meta
 
 from splinecli.capture.record import ESTIMATE
 from splinecli.errors import UsageError
@@ -34,7 +34,7 @@ from splinecli.pipeline.infer_options import (
     Display,
     parse_indices,
 )
-from splinecli.records.base import Count, FileName, NotNegative, Option, Positive, listed
+from splinecli.records.base import Count, FileName, NotNegative, Positive, flag, listed, option
 from splinecli.records.output_files import LEVEL_NORMALS, SURFACE_FILES, SURFACE_REPORT, file_names
 from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.surface_files import DEFAULT_FORMATS
@@ -56,79 +56,61 @@ def parse_circle(text: str) -> tuple[float, float, float]:
 class CalibrateOptions(Display, frozen=True, kw_only=True):
     """The options of `calibrate`."""
 
-    balls: Annotated[
-        tuple[Path, ...], Option("Arguments", "Folders of images of one mirror ball each.", "BALL")
-    ]
-    circles: Annotated[
-        tuple[tuple[float, float, float], ...],
-        Option(
-            "Input",
-            "Outline of the ball in pixels, y down. May be repeated, once for each BALL.",
-            "X,Y,R",
-            names="--circle",
-            parse=parse_circle,
-        ),
-    ] = ()
-    masks: Annotated[
-        tuple[Path, ...],
-        Option(
-            "Input",
-            f"{MASK_IMAGE.format('ball')} May be repeated, once for each BALL.",
-            "FILE",
-            names="--mask",
-        ),
-    ] = ()
-    ball_diameter: Annotated[
-        Positive | None,
-        Option(
-            "Input",
-            "Diameter of each ball in any unit, such as millimetres. The lamps' positions have the"
-            " same unit.",
-            "D",
-            "pixels",
-        ),
-    ] = None
-    camera_matrix: Annotated[
-        Path | None,
-        Option(
-            "Input",
-            "Text file of the 3 x 3 camera matrix in pixels.",
-            "FILE",
-            "focal length from EXIF, or a distant camera",
-        ),
-    ] = None
-    gray_ball: Annotated[
-        Path | None,
-        Option("Light intensities", "Images of a matte gray ball under the same lights.", "DIR"),
-    ] = None
-    gray_card: Annotated[
-        Path | None,
-        Option("Light intensities", "Images of a matte gray card that faces the camera.", "DIR"),
-    ] = None
-    lights_in_channels: Annotated[
-        bool,
-        Option(
-            "Light intensities",
-            "The images of the gray ball are colour images under three coloured lamps at once:"
-            " measure the crosstalk. BALL then contains one image under each lamp alone, in the"
-            " order R, G, B.",
-        ),
-    ] = False
-    transfer: Annotated[
-        str,
-        Option(
-            "Light intensities",
-            "Transfer curve of the gray target's images: auto, linear, srgb or gamma:G.",
-            "CURVE",
-            complete=shared.CURVES,
-        ),
-    ] = AUTOMATIC
-    compare: Annotated[
-        Path | None,
-        Option("Output", "Compare the result with the light directions in a text file.", "FILE"),
-    ] = None
-    output: Annotated[Path, Option("Output", "Folder of the results.", "OUT", names=OUTPUT)] = Path(
-        "calibration"
+    balls: tuple[Path, ...] = option(
+        "Arguments", "Folders of images of one mirror ball each.", "BALL", value=NODEFAULT
+    )
+    circles: tuple[tuple[float, float, float], ...] = option(
+        "Input",
+        "Outline of the ball in pixels, y down. May be repeated, once for each BALL.",
+        "X,Y,R",
+        value=(),
+        names="--circle",
+        parse=parse_circle,
+    )
+    masks: tuple[Path, ...] = option(
+        "Input",
+        f"{MASK_IMAGE.format('ball')} May be repeated, once for each BALL.",
+        "FILE",
+        value=(),
+        names="--mask",
+    )
+    ball_diameter: Positive | None = option(
+        "Input",
+        "Diameter of each ball in any unit, such as millimetres. The lamps' positions have the"
+        " same unit.",
+        "D",
+        "pixels",
+    )
+    camera_matrix: Path | None = option(
+        "Input",
+        "Text file of the 3 x 3 camera matrix in pixels.",
+        "FILE",
+        "focal length from EXIF, or a distant camera",
+    )
+    gray_ball: Path | None = option(
+        "Light intensities", "Images of a matte gray ball under the same lights.", "DIR"
+    )
+    gray_card: Path | None = option(
+        "Light intensities", "Images of a matte gray card that faces the camera.", "DIR"
+    )
+    lights_in_channels: bool = flag(
+        "Light intensities",
+        "The images of the gray ball are colour images under three coloured lamps at once:"
+        " measure the crosstalk. BALL then contains one image under each lamp alone, in the"
+        " order R, G, B.",
+    )
+    transfer: str = option(
+        "Light intensities",
+        "Transfer curve of the gray target's images: auto, linear, srgb or gamma:G.",
+        "CURVE",
+        value=AUTOMATIC,
+        complete=shared.CURVES,
+    )
+    compare: Path | None = option(
+        "Output", "Compare the result with the light directions in a text file.", "FILE"
+    )
+    output: Path = option(
+        "Output", "Folder of the results.", "OUT", value=Path("calibration"), names=OUTPUT
     )
     overwrite: shared.Overwrite = False
 
@@ -150,11 +132,11 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
                 hint="Photograph a matte gray or white ball",
             )
 
-        for option, values in (("--circle", self.circles), ("--mask", self.masks)):
+        for name, values in (("--circle", self.circles), ("--mask", self.masks)):
             if values and len(values) != len(self.balls):
                 times = "once" if len(values) == 1 else f"{len(values)} times"
                 raise UsageError(
-                    f"{option} is given {times} for {len(self.balls)} balls",
+                    f"{name} is given {times} for {len(self.balls)} balls",
                     hint="Give it once for each ball, in the same order",
                 )
 
@@ -178,137 +160,101 @@ def parse_level(text: str) -> tuple[tuple[int, int], ...]:
 class IntegrateOptions(Display, frozen=True, kw_only=True):
     """The options of `integrate`."""
 
-    normals: Annotated[
-        Path,
-        Option(
-            "Arguments",
-            "Normal map (.npy, .png, .tif, .mat), or a folder that infer wrote.",
-            "NORMALS",
-        ),
-    ]
-    mask: Annotated[
-        Path | None,
-        Option("Input", MASK_IMAGE.format("object"), "FILE", "all pixels that have a normal"),
-    ] = None
-    camera_matrix: Annotated[
-        Path | None,
-        Option(
-            "Input",
-            "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera.",
-            "FILE",
-            "as in report.json beside the normal map, or orthographic",
-        ),
-    ] = None
-    pixel_size: Annotated[
-        Annotated[float, Meta(ge=shared.SMALLEST_PIXEL_MM, le=shared.LARGEST_PIXEL_MM)] | None,
-        Option(
-            "Input",
-            "Width of a pixel of the photographs on the object in millimetres, for a surface in"
-            " millimetres.",
-            "MM",
-            "as given to infer --surface by report.json beside the normal map, or none",
-        ),
-    ] = None
-    pixel_aspect: Annotated[
-        Annotated[float, Meta(ge=0.01, le=100)],
-        Option(
-            "Input",
-            "Height of a pixel on the object, in widths of a pixel, for line scanners and scaled"
-            " images.",
-            "A",
-        ),
-    ] = 1.0
-    convention: Annotated[
-        Convention | None,
-        Option(
-            "Input",
-            "Green channel of a normal map of colours: opengl is y up, directx is y down.",
-            default="as in report.json beside it, or opengl",
-        ),
-    ] = None
-    colours: Annotated[
-        Path | None,
-        Option(
-            "Input",
-            "Image of the object's colours, for the mesh.",
-            "FILE",
-            "albedo.png beside NORMALS, if NORMALS is a folder",
-        ),
-    ] = None
-    prior: Annotated[
-        Path | None,
-        Option(
-            "Input",
-            "Depth map of the same view from elsewhere, such as a scan: the surface takes its"
-            " overall shape from it, and the detail from the normals. .npy, .tif or .exr, with"
-            " heights towards the camera in the unit of the result, or with depths in millimetres"
-            " for a perspective camera. NaN is unknown.",
-            "FILE",
-        ),
-    ] = None
-    discontinuity: Annotated[
-        NotNegative | None,
-        Option(
-            "Method",
-            shared.DISCONTINUITY_HELP,
-            "K",
-            f"as in report.json beside the normal map, or {DISCONTINUITY:g}",
-        ),
-    ] = None
-    prior_detail: Annotated[
-        Annotated[float, Meta(ge=1)] | None,
-        Option(
-            "Method",
-            "With --prior: shapes narrower than this come from the normals.",
-            "PIXELS",
-            "15 % of the object's size",
-        ),
-    ] = None
-    largest_step: Annotated[
-        NotNegative | None,
-        Option(
-            "Method",
-            "Leave out triangles whose corners differ by more than this height.",
-            "PIXELS",
-            "keep all",
-        ),
-    ] = None
-    level: Annotated[
-        tuple[tuple[int, int], ...] | None,
-        Option(
-            "Method",
-            "Level the surface, and write its normals: plane removes the slope of"
-            " its dominant plane; three or"
-            ' more pixels "X,Y X,Y X,Y" define the plane that becomes level.',
-            "plane|POINTS",
-            parse=parse_level,
-        ),
-    ] = None
-    output: Annotated[
-        Path | None,
-        Option("Output", "Folder of the results.", "OUT", "the folder of NORMALS", names=OUTPUT),
-    ] = None
-    formats: Annotated[
-        tuple[str, ...],
-        Option(
-            "Output",
-            f"Files to write, any of {', '.join(SURFACE_FILES)}: meshes, and depth maps in float32"
-            " or as a 16-bit picture (png). exr needs the extra 'exr'.",
-            "LIST",
-            names="--format",
-            items=SURFACE_FILES,
-        ),
-    ] = DEFAULT_FORMATS
-    decimate: Annotated[
-        Count | None,
-        Option(
-            "Output",
-            "Reduce the mesh to N triangles; a texture of the normals keeps the detail in GLB"
-            " (needs the extra 'mesh').",
-            "N",
-            "all",
-        ),
-    ] = None
+    normals: Path = option(
+        "Arguments",
+        "Normal map (.npy, .png, .tif, .mat), or a folder that infer wrote.",
+        "NORMALS",
+        value=NODEFAULT,
+    )
+    mask: Path | None = option(
+        "Input", MASK_IMAGE.format("object"), "FILE", "all pixels that have a normal"
+    )
+    camera_matrix: Path | None = option(
+        "Input",
+        "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera.",
+        "FILE",
+        "as in report.json beside the normal map, or orthographic",
+    )
+    pixel_size: (
+        Annotated[float, Meta(ge=shared.SMALLEST_PIXEL_MM, le=shared.LARGEST_PIXEL_MM)] | None
+    ) = option(
+        "Input",
+        "Width of a pixel of the photographs on the object in millimetres, for a surface in"
+        " millimetres.",
+        "MM",
+        "as given to infer --surface by report.json beside the normal map, or none",
+    )
+    pixel_aspect: Annotated[float, Meta(ge=0.01, le=100)] = option(
+        "Input",
+        "Height of a pixel on the object, in widths of a pixel, for line scanners and scaled"
+        " images.",
+        "A",
+        value=1.0,
+    )
+    convention: Convention | None = option(
+        "Input",
+        "Green channel of a normal map of colours: opengl is y up, directx is y down.",
+        default="as in report.json beside it, or opengl",
+    )
+    colours: Path | None = option(
+        "Input",
+        "Image of the object's colours, for the mesh.",
+        "FILE",
+        "albedo.png beside NORMALS, if NORMALS is a folder",
+    )
+    prior: Path | None = option(
+        "Input",
+        "Depth map of the same view from elsewhere, such as a scan: the surface takes its"
+        " overall shape from it, and the detail from the normals. .npy, .tif or .exr, with"
+        " heights towards the camera in the unit of the result, or with depths in millimetres"
+        " for a perspective camera. NaN is unknown.",
+        "FILE",
+    )
+    discontinuity: NotNegative | None = option(
+        "Method",
+        shared.DISCONTINUITY_HELP,
+        "K",
+        f"as in report.json beside the normal map, or {DISCONTINUITY:g}",
+    )
+    prior_detail: Annotated[float, Meta(ge=1)] | None = option(
+        "Method",
+        "With --prior: shapes narrower than this come from the normals.",
+        "PIXELS",
+        "15 % of the object's size",
+    )
+    largest_step: NotNegative | None = option(
+        "Method",
+        "Leave out triangles whose corners differ by more than this height.",
+        "PIXELS",
+        "keep all",
+    )
+    level: tuple[tuple[int, int], ...] | None = option(
+        "Method",
+        "Level the surface, and write its normals: plane removes the slope of"
+        " its dominant plane; three or"
+        ' more pixels "X,Y X,Y X,Y" define the plane that becomes level.',
+        "plane|POINTS",
+        parse=parse_level,
+    )
+    output: Path | None = option(
+        "Output", "Folder of the results.", "OUT", "the folder of NORMALS", names=OUTPUT
+    )
+    formats: tuple[str, ...] = option(
+        "Output",
+        f"Files to write, any of {', '.join(SURFACE_FILES)}: meshes, and depth maps in float32"
+        " or as a 16-bit picture (png). exr needs the extra 'exr'.",
+        "LIST",
+        value=DEFAULT_FORMATS,
+        names="--format",
+        items=SURFACE_FILES,
+    )
+    decimate: Count | None = option(
+        "Output",
+        "Reduce the mesh to N triangles; a texture of the normals keeps the detail in GLB"
+        " (needs the extra 'mesh').",
+        "N",
+        "all",
+    )
     overwrite: shared.Overwrite = False
 
     def __post_init__(self) -> None:
@@ -363,135 +309,97 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
     Without any number, DEFAULT_LIGHTS is used, or the number in the draws file.
     """
 
-    datasets: Annotated[
-        tuple[Path, ...],
-        Option(
-            "Arguments",
-            "Folders of captures with ground truth, or the captures themselves.",
-            "DATASET",
-        ),
-    ]
-    skip_first: Annotated[
-        tuple[tuple[str, int], ...],
-        Option(
-            "Input",
-            "Leave out the first N images of one capture, or of all. May be repeated.",
-            "[CAPTURE=]N",
-            "0",
-            parse=parse_skip,
-        ),
-    ] = ()
-    max_pixels: Annotated[
-        Count | None, Option("Input", "Score N random pixels of each capture.", "N", "all")
-    ] = None
+    datasets: tuple[Path, ...] = option(
+        "Arguments",
+        "Folders of captures with ground truth, or the captures themselves.",
+        "DATASET",
+        value=NODEFAULT,
+    )
+    skip_first: tuple[tuple[str, int], ...] = option(
+        "Input",
+        "Leave out the first N images of one capture, or of all. May be repeated.",
+        "[CAPTURE=]N",
+        "0",
+        value=(),
+        parse=parse_skip,
+    )
+    max_pixels: Count | None = option("Input", "Score N random pixels of each capture.", "N", "all")
     as_stored: shared.AsStored = False
     white_level: shared.WhiteLevel = None
-    lights: Annotated[
-        str | None,
-        Option(
-            "Lights",
-            "Estimate the lights of each draw from its images, and score them, too.",
-            "estimate",
-            "the captures' light files",
-        ),
-    ] = None
-    n_lights: Annotated[
-        tuple[int | None, ...],
-        Option(
-            "Lights",
-            "Number of lights in each draw. May be repeated.",
-            "K|all",
-            str(DEFAULT_LIGHTS),
-            parse=parse_light_count,
-        ),
-    ] = ()
-    trials: Annotated[
-        Count | None,
-        Option(
-            "Lights",
-            "Number of random draws.",
-            "T",
-            f"{DEFAULT_TRIALS}; {TRIALS_OF_MANY} with four methods or more",
-        ),
-    ] = None
+    lights: str | None = option(
+        "Lights",
+        "Estimate the lights of each draw from its images, and score them, too.",
+        "estimate",
+        "the captures' light files",
+    )
+    n_lights: tuple[int | None, ...] = option(
+        "Lights",
+        "Number of lights in each draw. May be repeated.",
+        "K|all",
+        str(DEFAULT_LIGHTS),
+        value=(),
+        parse=parse_light_count,
+    )
+    trials: Count | None = option(
+        "Lights",
+        "Number of random draws.",
+        "T",
+        f"{DEFAULT_TRIALS}; {TRIALS_OF_MANY} with four methods or more",
+    )
     seed: shared.RandomSeed = 0
-    draws: Annotated[
-        FileName | None,
-        Option("Lights", "Draws of lights: each line has light indices, counted from 0.", "FILE"),
-    ] = None
-    light_noise_deg: Annotated[
-        tuple[NotNegative, ...],
-        Option(
-            "Lights",
-            "Tilt the lights at random, with this standard deviation in degrees. May be repeated.",
-            "SIGMA",
-        ),
-    ] = (0.0,)
+    draws: FileName | None = option(
+        "Lights", "Draws of lights: each line has light indices, counted from 0.", "FILE"
+    )
+    light_noise_deg: tuple[NotNegative, ...] = option(
+        "Lights",
+        "Tilt the lights at random, with this standard deviation in degrees. May be repeated.",
+        "SIGMA",
+        value=(0.0,),
+    )
     refine_lights: shared.RefineLights = False
-    light_error_deg: Annotated[
-        float | None,
-        Option(
-            "Lights",
-            "With --refine-lights: usual error of the directions in degrees.",
-            "SIGMA",
-            "5",
-        ),
-    ] = None
-    methods: Annotated[
-        tuple[str, ...],
-        Option(
-            "Method",
-            f"Method to score: all, {listed(method_names())}. May be repeated.",
-            "M",
-            names="--method",
-            complete=(*method_names(), "all"),
-        ),
-    ] = (DEFAULT_METHOD,)
+    light_error_deg: float | None = option(
+        "Lights", "With --refine-lights: usual error of the directions in degrees.", "SIGMA", "5"
+    )
+    methods: tuple[str, ...] = option(
+        "Method",
+        f"Method to score: all, {listed(method_names())}. May be repeated.",
+        "M",
+        value=(DEFAULT_METHOD,),
+        names="--method",
+        complete=(*method_names(), "all"),
+    )
     weights: shared.Weights = None
-    rotations: Annotated[
-        Count | None,
-        Option(
-            "Method",
-            "Average the network's result over R views of each pixel: its lights rotated, for"
-            " spline-net also mirrored.",
-            "R",
-            "1; cnn-ps: 10",
-        ),
-    ] = None
+    rotations: Count | None = option(
+        "Method",
+        "Average the network's result over R views of each pixel: its lights rotated, for"
+        " spline-net also mirrored.",
+        "R",
+        "1; cnn-ps: 10",
+    )
     device: shared.DeviceName = "auto"
     precision: shared.PrecisionName = "auto"
-    jobs: Annotated[
-        Count | None,
-        Option("Speed", "Number of trials at a time.", "N", "number of cores; 1 on a GPU"),
-    ] = None
-    cluster: ClusterOptions = HERE
-    figures: Annotated[
-        bool, Option("Output", "Draw every method's maps for the first draw of each capture.")
-    ] = False
-    pixels: Annotated[
-        tuple[tuple[int, int], ...],
-        Option(
-            "Output",
-            "With --figures: show the observation maps of this pixel. May be repeated.",
-            "ROW,COLUMN",
-            names="--pixel",
-            parse=parse_pixel,
-        ),
-    ] = ()
-    relight: Annotated[
-        bool,
-        Option(
-            "Output",
-            "Estimate normals and material from the first draw of each capture, render the capture"
-            " under its other lights, and compare with the photographs.",
-        ),
-    ] = False
-    output: Annotated[FileName, Option("Output", "Folder of the results.", "OUT", names=OUTPUT)] = (
-        "evaluation"
+    jobs: Count | None = option(
+        "Speed", "Number of trials at a time.", "N", "number of cores; 1 on a GPU"
     )
-    overwrite: Annotated[
-        bool, Option("Output", "Compute all trials again, also those stored in OUT.")
-    ] = False
+    cluster: ClusterOptions = HERE
+    figures: bool = flag("Output", "Draw every method's maps for the first draw of each capture.")
+    pixels: tuple[tuple[int, int], ...] = option(
+        "Output",
+        "With --figures: show the observation maps of this pixel. May be repeated.",
+        "ROW,COLUMN",
+        value=(),
+        names="--pixel",
+        parse=parse_pixel,
+    )
+    relight: bool = flag(
+        "Output",
+        "Estimate normals and material from the first draw of each capture, render the capture"
+        " under its other lights, and compare with the photographs.",
+    )
+    output: FileName = option(
+        "Output", "Folder of the results.", "OUT", value="evaluation", names=OUTPUT
+    )
+    overwrite: bool = flag("Output", "Compute all trials again, also those stored in OUT.")
 
     CONFLICTS = (
         ("draws", "n_lights", "Leave --n-lights out: the draws determine the number of lights"),

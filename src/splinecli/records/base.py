@@ -1,8 +1,8 @@
 """Records: frozen options, settings and documents, declared once and checked when they are made.
 
-A field's annotation gives its type, its range (`msgspec.Meta`) and, for an option of a command, an
-`Option`. The command line, the checks, `as_dict`, `from_dict`, the JSON Schema and the man pages
-follow from it.
+A field's annotation gives its type and its range (`msgspec.Meta`). A field that is an option of a
+command has an `option` instead of a default, or an annotation with an `Option`. The command line,
+the checks, `as_dict`, `from_dict`, the JSON Schema and the man pages follow from them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import types
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, is_dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import isfinite
 from pathlib import Path
 from typing import (
@@ -27,7 +27,7 @@ from typing import (
     get_type_hints,
 )
 
-from msgspec import Meta, Struct, ValidationError, convert, to_builtins
+from msgspec import Meta, Struct, StructMeta, ValidationError, convert, to_builtins
 from msgspec.structs import fields, replace
 
 from splinecli.errors import SplinecliError, UsageError, check_one_of
@@ -56,9 +56,9 @@ class Option:
 
     panel: one of PANELS. metavar: placeholder for the value; "" for a flag or a choice. default:
     text for a default of None in the help. names: such as "--output -o". complete: the values for
-    shell completion, or a function that returns them. items: the names allowed in a list "a,b";
-    any other field with a tuple is an option that may be repeated. parse: converts a text to the
-    field's value, or each text of a repeated option.
+    shell completion, or a function that returns them. parse: converts a text to the field's value,
+    or each text of an option that may be repeated: any with a tuple, but without items. items: the
+    names allowed in a list "a,b". value: the default of the field, or NODEFAULT.
     """
 
     panel: str
@@ -69,6 +69,7 @@ class Option:
     complete: Callable[..., list[str]] | Collection[str] | None = None
     parse: Callable[[str], Any] | None = None
     items: Collection[str] = ()
+    value: Any = None
 
     @property
     def is_argument(self) -> bool:
@@ -90,7 +91,30 @@ class Option:
         return tuple(map(parse, given)) if isinstance(given, list) else parse(given)
 
 
-class Record(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+# of any type, so that they can stand for the default of a field; a flag is off by default
+option: Any = Option
+flag: Any = partial(Option, value=False)
+
+
+class _RecordMeta(StructMeta):
+    """Replaces the options of a record by the defaults of their fields."""
+
+    def __new__(
+        cls, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **settings: Any
+    ) -> Any:
+        options = {key: value for key, value in namespace.items() if isinstance(value, Option)}
+        made: Any = super().__new__(
+            cls,
+            name,
+            bases,
+            namespace | {key: each.value for key, each in options.items()},
+            **settings,
+        )
+        made.OPTIONS = getattr(made, "OPTIONS", {}) | options
+        return made
+
+
+class Record(Struct, metaclass=_RecordMeta, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A frozen record of options, whose fields are validated. Raises UsageError for an invalid
     value, or for two options that cannot be used together.
     """
@@ -172,7 +196,9 @@ def field_types(record: type) -> dict[str, Any]:
     """Return the annotation of each field of a record or dataclass."""
     hints = get_type_hints(record, include_extras=True)
     names = record.__dataclass_fields__ if is_dataclass(record) else record.__struct_fields__  # type: ignore[attr-defined]
-    return {name: hints[name] for name in names}
+    options = getattr(record, "OPTIONS", {})
+    kinds = {name: hints[name] for name in names}
+    return {n: Annotated[kind, options[n]] if n in options else kind for n, kind in kinds.items()}
 
 
 def settings(
