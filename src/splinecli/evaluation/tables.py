@@ -60,7 +60,7 @@ def trial_averages(evaluation: Evaluation, method: str) -> tuple[float, ...]:
     return tuple(float(np.mean(trial)) for trial in zip(*repeated, strict=False))
 
 
-def in_words(c: ComparisonReport) -> str:
+def comparison_in_words(c: ComparisonReport) -> str:
     """Return a sentence that describes a comparison."""
     better, worse = (c.first, c.second) if c.difference_deg < 0 else (c.second, c.first)
     size = f"{abs(c.difference_deg):.2f} degrees"

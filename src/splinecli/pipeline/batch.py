@@ -21,7 +21,13 @@ from splinecli.capture.files import IMAGE_SUFFIXES
 from splinecli.capture.formats.film import is_film
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
 from splinecli.estimate.methods import Estimator, MethodOptions, method_names
-from splinecli.pipeline.distribution import SAME_STORAGE, Item, LostError, distributor, this_worker
+from splinecli.pipeline.distribution import (
+    SAME_STORAGE,
+    LostError,
+    WorkItem,
+    distributor,
+    this_worker,
+)
 from splinecli.pipeline.incoming import unpacked
 from splinecli.pipeline.infer import (
     BASE_BYTES,
@@ -37,7 +43,7 @@ from splinecli.records.output_files import MAPS, NORMALS, REPORT, own_files
 from splinecli.results.files import UNUSABLE, UnfinishedError, read_report
 from splinecli.results.pages import (
     INDEX,
-    Entry,
+    IndexEntry,
     check_index_free,
     has_index,
     index_page,
@@ -245,7 +251,7 @@ def find_earlier(
         report = read_report(target)
         earlier = InferOptions.from_dict(report["options"])
         version, stamp = report["version"], report["inputs_sha256"]
-        if Entry.of(report).row.capture != target.name:  # raises if the report is incomplete
+        if IndexEntry.of(report).row.capture != target.name:  # raises if the report is incomplete
             raise ValueError
     except UnfinishedError as error:
         found = next((name for name in own_files() if (target / name).exists()), None)
@@ -314,7 +320,7 @@ def infer_batch(
     with_index = len(members) > 1 or shard is not None or has_index(output)
     if with_index:
         check_index_free(output, overwrite=redo == "all")
-    entries: dict[int, Entry] = {}
+    entries: dict[int, IndexEntry] = {}
     if cluster.address is None and not cluster.workers:
         cluster = cluster.replace(workers=choose_workers(members, options))
     outcomes: Iterable[tuple[int, Outcome]]
@@ -327,7 +333,7 @@ def infer_batch(
         )
     for number, outcome in outcomes:
         if outcome.status != "changed":
-            entries[number] = Entry.of(outcome.report)
+            entries[number] = IndexEntry.of(outcome.report)
         yield outcome
     if with_index and members:
         with held_folder(output, observer.warn, wait=True):
@@ -348,7 +354,7 @@ def _on_workers(
     weights = make_method(options.replace(device="cpu") if cluster.address else options).weights
     infer = partial(_infer, options, redo, None if weights is None else weights["sha256"])
     items = (
-        Item((n, each), str(each.folder), expected_bytes(each, options))
+        WorkItem((n, each), str(each.folder), expected_bytes(each, options))
         for n, each in enumerate(members)
     )
     with (

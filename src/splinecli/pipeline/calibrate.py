@@ -17,9 +17,9 @@ from splinecli.lights.calibration.circle import Circle
 from splinecli.lights.calibration.crosstalk import measure_crosstalk
 from splinecli.lights.calibration.lamps import (
     Target,
+    calibration_lines,
     calibration_report,
     measure_light_intensities,
-    summary_lines,
     triangulate_lamps,
 )
 from splinecli.maths import Float64Array
@@ -69,7 +69,7 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
         report["warnings"] += warnings
         report["crosstalk"] = None if crosstalk is None else crosstalk.round(6).tolist()
         texts = {DIRECTIONS: rows_text(lights.directions)}
-        said = summary_lines(report)
+        said = calibration_lines(report)
         if intensities is not None:
             texts[INTENSITIES] = rows_text(intensities)
             said.append(f"The light intensities are in {options.output / INTENSITIES}")

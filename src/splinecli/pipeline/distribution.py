@@ -183,7 +183,7 @@ class LostError(SplinecliError):
 
 
 @dataclass(frozen=True)
-class Item:
+class WorkItem:
     """The arguments of Work.do, a name for messages, and the memory in bytes that the item
     needs.
     """
@@ -268,10 +268,10 @@ class Distributor:
     work: Work
     options: ClusterOptions
     observer: Observer
-    running: dict[Future, Item] = field(default_factory=dict)
+    running: dict[Future, WorkItem] = field(default_factory=dict)
     _done: SimpleQueue[Future] = field(default_factory=SimpleQueue)
 
-    def run(self, items: Iterable[Item]) -> Iterator[tuple[Item, Any]]:
+    def run(self, items: Iterable[WorkItem]) -> Iterator[tuple[WorkItem, Any]]:
         """Yield each item with its result, or with a LostError, as it finishes.
 
         Raises SplinecliError, also if the scheduler was lost. The message names the worker.
@@ -356,7 +356,7 @@ class Distributor:
             )
         return with_gpu
 
-    def _submit(self, item: Item, workers: dict[str, dict[str, Any]]) -> None:
+    def _submit(self, item: WorkItem, workers: dict[str, dict[str, Any]]) -> None:
         needed = {"GPU": 1.0} if self.options.gpu else {}
         if any("MEMORY" in _resources(info) for info in workers.values()):
             needed["MEMORY"] = item.memory
@@ -370,7 +370,7 @@ class Distributor:
         self.running[future] = item
         future.add_done_callback(self._done.put)
 
-    def _take_result(self, future: Future) -> Iterator[tuple[Item, Any]]:
+    def _take_result(self, future: Future) -> Iterator[tuple[WorkItem, Any]]:
         from distributed.scheduler import KilledWorker
 
         if future.cancelled():

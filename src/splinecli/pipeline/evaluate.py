@@ -30,7 +30,7 @@ from splinecli.evaluation.trials import (
     TrialStore,
     open_to_score,
 )
-from splinecli.pipeline.distribution import Item, LostError, distributor
+from splinecli.pipeline.distribution import LostError, WorkItem, distributor
 from splinecli.pipeline.infer import source_bytes
 from splinecli.pipeline.infer_options import ClusterOptions
 from splinecli.pipeline.options import EvaluateOptions
@@ -164,7 +164,7 @@ def _score_on_workers(
     fingerprints = tuple((estimator.name, estimator.fingerprint) for estimator in estimators)
     score = partial(_score, uuid.uuid4().hex, fingerprints, method_options)
     memory = cache(lambda folder: source_bytes(lambda: open_capture(folder)))
-    items = (Item((draw,), draw.reading.name, memory(draw.reading.folder)) for draw in draws)
+    items = (WorkItem((draw,), draw.reading.name, memory(draw.reading.folder)) for draw in draws)
     lost: LostError | None = None
     with distributor(score, output, cluster, observer) as workers:
         for item, result in workers.run(items):

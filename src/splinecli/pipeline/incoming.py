@@ -17,7 +17,7 @@ from splinecli.capture.files import digest, natural_key, stamp_content
 from splinecli.capture.formats.film import FEWEST_FRAMES, choose_frames, is_film, read_frames
 from splinecli.errors import InputError, OutputError, UsageError
 from splinecli.pictures.maps import encode_png
-from splinecli.pipeline.infer_options import Reading, Redo
+from splinecli.pipeline.infer_options import ReadingOptions, Redo
 from splinecli.system.files import read_json
 from splinecli.system.progress import Observer
 from splinecli.system.publishing import held_folder, is_plain, new_files, refuse_link
@@ -29,7 +29,7 @@ _FRAME = re.compile(r"frame-\d{6,}\.png")
 
 
 def unpacked(
-    capture: Path, output: Path, reading: Reading, observer: Observer, *, redo: Redo
+    capture: Path, output: Path, reading: ReadingOptions, observer: Observer, *, redo: Redo
 ) -> Path:
     """Return the capture; for a film, the folder in `output` with its frames, which are extracted
     if needed.

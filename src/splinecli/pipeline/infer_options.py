@@ -83,7 +83,7 @@ AsStored = Annotated[
         " light intensities.",
     ),
 ]
-WhiteLevel = Annotated[
+GivenWhiteLevel = Annotated[
     Positive | None,
     Option(
         "Input",
@@ -137,7 +137,7 @@ def parse_workers(text: str) -> int:
     return 0 if text == "auto" else int(text)
 
 
-class Workers(Record, frozen=True, kw_only=True):
+class WorkerOptions(Record, frozen=True, kw_only=True):
     """The number of local processes that work on the items of a command; 0 means as many as the
     machine can use.
     """
@@ -152,7 +152,7 @@ class Workers(Record, frozen=True, kw_only=True):
     )
 
 
-class ClusterOptions(Workers, frozen=True, kw_only=True):
+class ClusterOptions(WorkerOptions, frozen=True, kw_only=True):
     """Where the items of a command are processed: in this process, in other local processes, or on
     a Dask cluster.
     """
@@ -186,7 +186,7 @@ class ClusterOptions(Workers, frozen=True, kw_only=True):
 HERE = ClusterOptions()
 
 
-class Reading(Record, frozen=True, kw_only=True):
+class ReadingOptions(Record, frozen=True, kw_only=True):
     """The options of `infer` and `info` that select the files of a capture and how to read them.
 
     The help describes each option. None stands for the default given there. Raises UsageError.
@@ -225,7 +225,7 @@ class Reading(Record, frozen=True, kw_only=True):
         "Folder with images of a uniform white surface: one for all lights, or one for each light.",
         "DIR",
     )
-    white_level: WhiteLevel = None
+    white_level: GivenWhiteLevel = None
     lights: FileName | None = option(
         "Lights",
         f"Light directions ({light_suffixes()}): x y z for each image, z to the camera."
@@ -421,7 +421,7 @@ def parse_indices(text: str, title: str) -> tuple[int, ...]:
         ) from None
 
 
-class InferOptions(Reading, frozen=True, kw_only=True):
+class InferOptions(ReadingOptions, frozen=True, kw_only=True):
     """The options of `infer`; see its help. Raises UsageError if a value is invalid or two options
     conflict.
     """
@@ -502,7 +502,7 @@ class InferOptions(Reading, frozen=True, kw_only=True):
     )
 
     CONFLICTS = (
-        *Reading.CONFLICTS,
+        *ReadingOptions.CONFLICTS,
         ("n_lights", "light_indices", LEAVE_ONE),
         ("mask", "auto_mask", LEAVE_ONE),
     )
@@ -564,7 +564,7 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         return MethodOptions(self.weights, device=self.device, precision=self.precision)
 
     def check_files(self) -> None:
-        """See Reading. Also raise UsageError if a package required by the options is not
+        """See ReadingOptions. Also raise UsageError if a package required by the options is not
         installed.
         """
         super().check_files()
@@ -663,7 +663,7 @@ class WatchOptions(Record, frozen=True, kw_only=True):
 
 
 class InfoOptions(Display, frozen=True, kw_only=True):
-    """The options of `info` in addition to Reading; see its help."""
+    """The options of `info` in addition to ReadingOptions; see its help."""
 
     capture: Path = option(
         "Arguments", "Folder with the images of one object, or a film.", "CAPTURE", value=NODEFAULT

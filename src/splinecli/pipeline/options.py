@@ -325,7 +325,7 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
     )
     max_pixels: Count | None = option("Input", "Score N random pixels of each capture.", "N", "all")
     as_stored: shared.AsStored = False
-    white_level: shared.WhiteLevel = None
+    white_level: shared.GivenWhiteLevel = None
     lights: str | None = option(
         "Lights",
         "Estimate the lights of each draw from its images, and score them, too.",

@@ -127,7 +127,7 @@ class Record(Struct, metaclass=_RecordMeta, frozen=True, kw_only=True, forbid_un
         for name, kind in field_types(type(self)).items():
             option, value = option_of(kind), getattr(self, name)
             title = f"option {name!r}" if option is None else long_name(name, option)
-            fit(kind, value, title, UsageError)
+            converted(kind, value, title, UsageError)
             if option is not None:
                 for item in value if option.items else ():
                     check_one_of(name.removesuffix("s"), item, option.items)
@@ -167,7 +167,7 @@ class Record(Struct, metaclass=_RecordMeta, frozen=True, kw_only=True, forbid_un
         for name, kind in field_types(cls).items():
             if (option := option_of(kind)) is not None:
                 if (value := given.pop(name)) is not None:
-                    values[name] = _converted(kind, option, value, long_name(name, option))
+                    values[name] = _from_typer(kind, option, value, long_name(name, option))
                 elif option.is_argument:
                     values[name] = ()
             elif isinstance(kind, type) and issubclass(kind, Record):
@@ -175,12 +175,12 @@ class Record(Struct, metaclass=_RecordMeta, frozen=True, kw_only=True, forbid_un
         return cls(**values)
 
 
-def _converted(kind: Any, option: Option, given: Any, title: str) -> Any:
+def _from_typer(kind: Any, option: Option, given: Any, title: str) -> Any:
     """Convert Typer's value to a value of the field's type. Raises UsageError."""
     value = option.value_of(given, title)
     if (number := number_of(kind)) is not None and option.parse is None:
         one: Any = Annotated[number, limits(kind)]
-        items = [fit(one, item, title, UsageError, strict=False) for item in _each(value)]
+        items = [converted(one, item, title, UsageError, strict=False) for item in _each(value)]
         value = tuple(items) if isinstance(value, tuple) else items[0]
     is_name = PATH in _metadata(kind)
     is_file = (is_name or isinstance(value, Path)) and not option.is_argument
@@ -214,11 +214,12 @@ def settings(
         if name not in kinds:
             raise error(f"unknown {noun} {name!r}; known are {', '.join(sorted(kinds))}")
     return {
-        name: fit(kinds[name], value, f"{noun} {name!r}", error) for name, value in values.items()
+        name: converted(kinds[name], value, f"{noun} {name!r}", error)
+        for name, value in values.items()
     }
 
 
-def fit(
+def converted(
     kind: Any, value: Any, title: str, error: type[SplinecliError], *, strict: bool = True
 ) -> Any:
     """Convert a value to a type, such as a list to a tuple. Raises the given error, which begins
@@ -233,7 +234,7 @@ def fit(
         items = found.values() if isinstance(found, dict) else _each(found)
         if all(isfinite(item) for item in items if isinstance(item, float)):
             return found
-    raise error(f"{title} is {value!r}; expected {in_words(kind)}")
+    raise error(f"{title} is {value!r}; expected {kind_in_words(kind)}")
 
 
 def option_of(kind: Any) -> Option | None:
@@ -271,7 +272,7 @@ def plain(kind: Any) -> Any:
     return list[plain(get_args(kind)[0])] if get_origin(kind) is tuple else kind  # type: ignore[misc]
 
 
-def in_words(kind: Any) -> str:
+def kind_in_words(kind: Any) -> str:
     """Describe the values of a type, such as "a number from 0 to 1"."""
     bare = plain(kind)
     if get_origin(bare) is Union:
@@ -281,7 +282,7 @@ def in_words(kind: Any) -> str:
         return " or ".join(names) if len(names) < 3 else f"one of {', '.join(names)}"
     if get_origin(bare) in (list, dict):
         whole = "list" if get_origin(bare) is list else "table"
-        return f"a {whole}, each {in_words(Annotated[get_args(bare)[-1], limits(kind)])}"
+        return f"a {whole}, each {kind_in_words(Annotated[get_args(bare)[-1], limits(kind)])}"
     if bare not in (int, float):
         return {bool: "true or false", str: "a text", Path: "a text"}.get(
             bare, "a table of settings"

@@ -229,7 +229,7 @@ def _data_url(picture: Picture) -> str:
 INDEX = "index.html"
 
 
-class Row(NamedTuple):
+class IndexRow(NamedTuple):
     """One row of the overview, as text. A capture that failed has only its name and the error."""
 
     capture: str
@@ -242,28 +242,28 @@ class Row(NamedTuple):
     error: str = ""
 
 
-HEADER = Row(
+HEADER = IndexRow(
     "capture", "lights", "pixels", "MAE", "likely within 5°", "warnings", "seconds", "error"
 )
 
 
-class Entry(NamedTuple):
+class IndexEntry(NamedTuple):
     """The page's entry for one capture: its row, the names of its files, and its warnings."""
 
-    row: Row
+    row: IndexRow
     files: tuple[str, ...] = ()
     words: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, report: Mapping[str, Any]) -> Entry:
+    def of(cls, report: Mapping[str, Any]) -> IndexEntry:
         """Return the entry for a report (see report_of), or for a document with `capture` and
         `error`.
         """
         if "error" in report:
-            return cls(Row(report["capture"], error=report["error"]))
+            return cls(IndexRow(report["capture"], error=report["error"]))
         errors, expected = report["angular_error_deg"], report["expected_under_5"]
         seconds, warnings = report["seconds"], report["warnings"]
-        row = Row(
+        row = IndexRow(
             report["capture"],
             lights=str(report["n_lights"]),
             pixels=f"{report['n_pixels']:,}",
@@ -276,7 +276,7 @@ class Entry(NamedTuple):
         return cls(row, tuple(report["files"]), words)
 
 
-def index_page(entries: Sequence[Entry], output: Path) -> str:
+def index_page(entries: Sequence[IndexEntry], output: Path) -> str:
     """Return the overview page with small normal maps and links to the files, for the folder above
     the captures.
     """
@@ -321,7 +321,7 @@ def _thumbnail(path: Path) -> str | None:
     return picture_url(jpeg.tobytes(), "jpeg") if done else None
 
 
-def with_earlier(entries: Sequence[Entry], folder: Path) -> list[Entry]:
+def with_earlier(entries: Sequence[IndexEntry], folder: Path) -> list[IndexEntry]:
     """Return the entries, followed by entries for other captures with results in the folder, sorted
     by name.
     """
@@ -331,7 +331,7 @@ def with_earlier(entries: Sequence[Entry], folder: Path) -> list[Entry]:
         if path.parent.name in names or path.parent.is_symlink():
             continue
         try:
-            entry = Entry.of(read_report(path.parent))
+            entry = IndexEntry.of(read_report(path.parent))
         except Exception as error:  # a report from elsewhere may be invalid in any way
             if is_out_of_memory(error):
                 raise

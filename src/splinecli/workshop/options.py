@@ -9,7 +9,7 @@ from msgspec import NODEFAULT, Meta
 
 from splinecli.errors import UsageError
 from splinecli.pipeline import infer_options as shared
-from splinecli.pipeline.infer_options import OUTPUT, Display, Workers
+from splinecli.pipeline.infer_options import OUTPUT, Display, WorkerOptions
 from splinecli.records.base import Count, Natural, NotNegative, Record, Seed, flag, option
 from splinecli.workshop import training
 
@@ -24,7 +24,7 @@ class PrepareOptions(Display, frozen=True, kw_only=True):
         value=(),
     )
     as_stored: shared.AsStored = False
-    white_level: shared.WhiteLevel = None
+    white_level: shared.GivenWhiteLevel = None
     update: shared.Update = False
     scenes: Natural = option("Scenes", "Render N random scenes.", "N", value=0)
     meshes: tuple[Path, ...] = option(
@@ -57,7 +57,7 @@ class PrepareOptions(Display, frozen=True, kw_only=True):
     output: Path = option(
         "Output", "Folder of the pixel set.", "SET", value=NODEFAULT, names=OUTPUT
     )
-    processes: Workers = Workers()
+    processes: WorkerOptions = WorkerOptions()
 
 
 def parse_light_counts(text: str) -> dict[str, int]:

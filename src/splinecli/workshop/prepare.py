@@ -11,7 +11,7 @@ from typing import Any
 from splinecli.capture import find_captures
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.pictures.maps import encode_png
-from splinecli.pipeline.distribution import Item, LostError, distributor
+from splinecli.pipeline.distribution import LostError, WorkItem, distributor
 from splinecli.pipeline.infer_options import ClusterOptions
 from splinecli.records.output_files import CONTACT_SHEET
 from splinecli.system.files import UNFINISHED, as_splinecli_error, check_writable, write_bytes
@@ -157,7 +157,7 @@ def _add_from_workers(
     try:
         with distributor(render, folder, cluster, observer) as workers:
             in_set = ((n, None) for n in range(len(plan.names)) if n not in missing)
-            items = (Item((n,), plan.names[n]) for n in missing)
+            items = (WorkItem((n,), plan.names[n]) for n in missing)
             ended = ((item.args[0], shape) for item, shape in workers.run(items))
             for number, result in chain(in_set, ended):
                 rendered[number] = result

@@ -4,24 +4,18 @@ channel shows.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from splinecli.capture.channel_lights import CHANNELS, check_crosstalk
-from splinecli.capture.files import AMBIENT, CaptureFiles, find_named
-from splinecli.capture.formats.facts import check_exposures
-from splinecli.capture.formats.images import common_size
 from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
-from splinecli.capture.record import placeholders
-from splinecli.capture.source import CaptureSource
 from splinecli.errors import InputError
 from splinecli.lights.calibration.balls import BallFiles
-from splinecli.lights.calibration.lamps import target_normals
+from splinecli.lights.calibration.lamps import read_target
 from splinecli.maths import Bools, Float64Array, Floats
 
-_MOST_PIXELS, _MIN_PIXELS, _FITS = 1 << 16, 50, 10
+_MIN_PIXELS, _FITS = 50, 10
 
 
 def measure_crosstalk(
@@ -56,20 +50,9 @@ def measure_crosstalk(
             hint="For each colour image, photograph the mirror ball under each lamp alone, in the"
             " order R, G, B",
         )
-    mask, normals = target_normals(files, common_size(files.facts)[0][:2], "ball")
-    check_exposures(files.facts)
-    capture = CaptureSource(
-        CaptureFiles("gray ball", files.folder.name, files.folder, files.images, files.folder),
-        files.facts,
-        placeholders(count),
-        np.ones((count, 3)),
-        radiometry=replace(radiometry, ambient=find_named(files.folder, AMBIENT)),
-    )
-    rows = np.linspace(0, len(normals) - 1, min(len(normals), _MOST_PIXELS)).astype(np.intp)
+    normals, rows, images = read_target(files, "ball", radiometry)
     matrices = []
-    for number, image in enumerate(
-        capture.read_pixels(mask, range(count), lambda pixels: pixels, wanted=rows)
-    ):
+    for number, image in enumerate(images):
         saturated = np.zeros(len(normals), np.bool_)
         saturated[image.find_saturated(None).saturated] = True
         lights = light_directions[CHANNELS * number : CHANNELS * number + CHANNELS]

@@ -8,7 +8,7 @@ plane.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -17,7 +17,8 @@ import numpy as np
 from splinecli.capture.files import AMBIENT, CaptureFiles, find_named
 from splinecli.capture.formats.facts import check_exposures
 from splinecli.capture.formats.images import ExpectedSize, common_size, read_mask
-from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
+from splinecli.capture.linearise import AS_STORED, RadiometricCalibration, StoredPixels
+from splinecli.capture.record import placeholders
 from splinecli.capture.source import CaptureSource
 from splinecli.errors import InputError
 from splinecli.images.saturation import Saturation
@@ -30,7 +31,7 @@ from splinecli.lights.calibration.balls import (
     reflect,
 )
 from splinecli.lights.calibration.circle import Circle, circle_from_mask
-from splinecli.maths import Bools, Float64Array
+from splinecli.maths import Bools, Float64Array, Indices
 from splinecli.maths.normals import angle_between_deg
 from splinecli.maths.pixel_grid import focal_length, ray_basis
 
@@ -63,18 +64,9 @@ def measure_light_intensities(
             f"found {len(files.images)} images, expected {n_lights}, one for each light",
             path=files.folder,
         )
-    mask, normals = target_normals(files, common_size(files.facts)[0][:2], target)
-    check_exposures(files.facts)
-    capture = CaptureSource(
-        CaptureFiles("gray target", files.folder.name, files.folder, files.images, files.folder),
-        files.facts,
-        light_directions,
-        np.ones((n_lights, 3)),
-        radiometry=replace(radiometry, ambient=find_named(files.folder, AMBIENT)),
-    )
-    rows = np.linspace(0, len(normals) - 1, min(len(normals), 1 << 16)).astype(np.int64)
+    normals, rows, images = read_target(files, target, radiometry)
     values, found = [], []
-    for image in capture.read_pixels(mask, range(n_lights), lambda pixels: pixels, wanted=rows):
+    for image in images:
         found.append(image.find_saturated(None))
         values.append(image.linear.astype(np.float64))
     saturated = Saturation(len(normals), tuple(found), rows=rows, even=True).flags
@@ -102,7 +94,28 @@ def measure_light_intensities(
     return np.asarray(intensities / intensities.mean())
 
 
-def target_normals(
+def read_target(
+    files: BallFiles, target: Target, radiometry: RadiometricCalibration
+) -> tuple[Float64Array, Indices, Iterator[StoredPixels]]:
+    """Return the normals (P, 3) of a target, the numbers of some of its pixels, and an iterator
+    over these pixels in each image.
+    """
+    mask, normals = _target_normals(files, common_size(files.facts)[0][:2], target)
+    check_exposures(files.facts)
+    count = len(files.images)
+    capture = CaptureSource(
+        CaptureFiles("gray target", files.folder.name, files.folder, files.images, files.folder),
+        files.facts,
+        placeholders(count),
+        np.ones((count, 3)),
+        radiometry=replace(radiometry, ambient=find_named(files.folder, AMBIENT)),
+    )
+    rows = np.linspace(0, len(normals) - 1, min(len(normals), 1 << 16)).astype(np.intp)
+    images = capture.read_pixels(mask, range(count), lambda pixels: pixels, wanted=rows)
+    return normals, rows, images
+
+
+def _target_normals(
     files: BallFiles, shape: tuple[int, ...], target: Target
 ) -> tuple[Bools, Float64Array]:
     """Return the mask (H, W) of the target and the normals (P, 3) of its pixels."""
@@ -308,7 +321,7 @@ def calibration_report(
     }
 
 
-def summary_lines(report: dict[str, Any]) -> list[str]:
+def calibration_lines(report: dict[str, Any]) -> list[str]:
     """Return the lines of a report for people: the outlines, and how well balls and compared lights
     agree.
     """
