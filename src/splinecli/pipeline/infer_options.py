@@ -5,6 +5,7 @@ to JSON.
 # The options form a table: name and type, then panel, help text and kind of value.
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import re
@@ -23,19 +24,14 @@ from splinecli.capture.light_rows import EXCHANGED, LightForm, parse_light_frame
 from splinecli.capture.linearise import parse_window
 from splinecli.capture.near_lamps import LampOptions
 from splinecli.capture.reader import EQUAL
-from splinecli.capture.record import (
-    ESTIMATE,
-    SIDES_DEG,
-    LightFinder,
-    azimuth_of,
-    check_light_indices,
-)
+from splinecli.capture.record import ESTIMATE, SIDES_DEG, azimuth_of, check_light_indices
 from splinecli.errors import UsageError
 from splinecli.estimate.methods import DEFAULT_METHOD, MethodOptions, check_method, method_names
 from splinecli.images.alignment import MIN_IMAGES
 from splinecli.maths.normals import Convention
 from splinecli.maths.robust import MIN_LIGHTS
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
+from splinecli.recipe.work import RecipeOptions
 from splinecli.records import base as records
 from splinecli.records.base import (
     FileName,
@@ -385,14 +381,18 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
         automatic = self.transfer == AUTOMATIC
         return RadiometricCalibration(parse_transfer(self.transfer), dark, flats, automatic)
 
+    @property
+    def recipe(self) -> RecipeOptions:
+        """How the recipe prepares the capture."""
+        return RecipeOptions(
+            align=self.align,
+            finds_lights=self.finds_lights,
+            first_light=self.first_light,
+            strict=self.strict,
+        )
+
     def open(self, folder: Path) -> CaptureSource:
         """Open the capture in the folder with these options. Raises InputError."""
-        find: LightFinder | None = None
-        if self.finds_lights:
-            from splinecli.lights.unknown_lights import find_lights
-
-            find = partial(find_lights, first_light=self.first_light)
-
         return open_capture(
             folder,
             lights=self.light_file,
@@ -405,7 +405,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
             lights_format=self.light_format,
             lamps=self.lamps,
             window=parse_window(self.crop, self.scale),
-            find_lights=find,
+            needs_lights=not self.finds_lights,
             lights_in_channels=self.lights_in_channels,
             crosstalk=self.crosstalk,
         )
@@ -557,6 +557,15 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
                 given = records.option_of(kind)
                 found[records.long_name(name, given) if given else "--maps"] = True
         return list(found)
+
+    @property
+    def recipe(self) -> RecipeOptions:
+        return dataclasses.replace(
+            super().recipe,
+            as_stored=self.as_stored,
+            auto_mask=self.auto_mask,
+            refine_lights=self.refine_lights,
+        )
 
     @property
     def method_options(self) -> MethodOptions:

@@ -18,7 +18,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from capture.conftest import WriteImage
 from scenes import ring_lights, with_chunk, write_capture
-from splinecli.capture import open_capture, read_capture, read_image, read_mask
+from splinecli.capture import open_capture, read_image, read_mask
 from splinecli.capture.formats.facts import (
     UPRIGHT,
     Exposure,
@@ -28,6 +28,7 @@ from splinecli.capture.formats.facts import (
 )
 from splinecli.capture.formats.images import decode_image
 from splinecli.errors import InputError
+from splinecli.recipe import read_capture
 from splinecli.records import capture_warnings
 
 RNG = np.random.default_rng(2)
@@ -95,11 +96,7 @@ def test_jpeg_channels_and_exif_orientation(write_image: WriteImage) -> None:
     exif = b"Exif\0\0II*\0" + struct.pack("<IHHHII", 8, 1, 0x112, 3, 1, 6) + b"\0" * 4
     path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:])
     # the segment works: by default OpenCV turns the image
-    assert cv2.imread(str(path)).shape == (
-        32,
-        16,
-        3,
-    )
+    assert cv2.imread(str(path)).shape == (32, 16, 3)
     image = read_image(path)
     assert image.shape == (16, 32, 3)
     apart = np.r_[:14, 18:32]  # the chroma is subsampled, so the colours mix where they meet

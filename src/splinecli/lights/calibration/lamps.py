@@ -104,10 +104,12 @@ def read_target(
     check_exposures(files.facts)
     count = len(files.images)
     capture = CaptureSource(
-        CaptureFiles("gray target", files.folder.name, files.folder, files.images, files.folder),
-        files.facts,
-        placeholders(count),
-        np.ones((count, 3)),
+        files=CaptureFiles(
+            "gray target", files.folder.name, files.folder, files.images, files.folder
+        ),
+        facts=files.facts,
+        light_directions=placeholders(count),
+        light_intensities=np.ones((count, 3)),
         radiometry=replace(radiometry, ambient=find_named(files.folder, AMBIENT)),
     )
     rows = np.linspace(0, len(normals) - 1, min(len(normals), 1 << 16)).astype(np.intp)
