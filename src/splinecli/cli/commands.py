@@ -246,8 +246,9 @@ def _run(trainer: Trainer, messages: Messages) -> None:
 
 
 def _losses(metrics: Metrics) -> str:
-    """Return the losses in words. Example: "1.5 minutes: loss 0.412, map 0.051, 8.31 deg, 9.02 deg
-    in validation".
+    """Return the losses in words.
+
+    Example: "1.5 minutes: loss 0.412, map 0.051, 8.31 deg, 9.02 deg in validation".
     """
     validation = (
         ""

@@ -1,5 +1,6 @@
-"""The Typer app, and the entry point, which turns every error into an exit code. Importing it must
-stay cheap.
+"""The Typer app and the entry point, which turns every error into an exit code.
+
+Importing it must stay cheap.
 """
 
 from __future__ import annotations
@@ -57,11 +58,10 @@ from splinecli.system.machine import check_address_space, keep_freed_memory
 
 
 def command(function: Callable[..., int | None], module: str) -> Callable[..., int | None]:
-    """Return a function for Typer that accepts the options of a function's records, and calls it
-    with the records.
+    """Return a function for Typer that takes the options of a function's records.
 
-    The module defines the records. It is imported here, so that it does not slow down the help of
-    other commands.
+    It calls the function with the records. The module defines the records. It is imported here, so
+    that it does not slow down the help of other commands.
     """
     kinds = get_type_hints(function, localns=vars(import_module(module)))
     del kinds["return"]
@@ -101,8 +101,9 @@ def _options(record: type[Record]) -> Iterator[tuple[str, Option, Any, Any]]:
 
 
 def _parameter(name: str, option: Option, kind: Any, default: Any) -> inspect.Parameter:
-    """Return Typer's parameter for a field. Record.from_arguments converts texts to numbers and
-    lists.
+    """Return Typer's parameter for a field.
+
+    Record.from_arguments converts texts to numbers and lists.
     """
     typed, metavar, complete = plain(kind), option.metavar, option.complete
     parts = (typed, *get_args(typed))
@@ -175,15 +176,14 @@ class Command(TyperCommand):
         return typer.main.get_command(alone)
 
     def __getattribute__(self, name: str) -> Any:
-        """Return an attribute, creating it now if it depends on the options, because their imports
-        are slow.
-        """
+        """Return an attribute, creating the options only now, because their imports are slow."""
         own = self._made if name in ("params", "callback") else super()
         return own.__getattribute__(name)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments. The context is added to parser errors, so that the message names the
-        command.
+        """Parse the arguments.
+
+        The context is added to parser errors, so that the message names the command.
         """
         # The parser removes them from the list.
         wants_json, wants_lines = JSON in args, "--jsonl" in args
@@ -228,8 +228,9 @@ class Command(TyperCommand):
             raise
 
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-        """Return the completions of a word, each with one line of help: shells treat a second line
-        as another word.
+        """Return the completions of a word, each with one line of help.
+
+        Shells treat a second line as another word.
         """
         items = super().shell_complete(ctx, incomplete)
         for item in items:  # Typer breaks the help beside an option at 80 columns
@@ -237,9 +238,7 @@ class Command(TyperCommand):
         return items
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return the parts of the usage line, without the braces that Typer puts around
-        arguments.
-        """
+        """Return the parts of the usage line, without the braces that Typer adds."""
         return [re.sub("[{}]", "", piece) for piece in super().collect_usage_pieces(ctx)]
 
     def get_help_option(self, ctx: Any) -> Any:
@@ -310,9 +309,7 @@ for _name, (_function, _) in COMMANDS.items():
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run `splinecli ARGS` and return the exit code (the contract is in
-    docs/files-and-frames.md).
-    """
+    """Run `splinecli ARGS` and return the exit code (see docs/files-and-frames.md)."""
     _repair_streams()
     # By default, PyTorch's threads spin while they wait for each other. On a machine that is busy
     # with other work this takes cores from the thread that computes. PyTorch reads the variable
@@ -350,11 +347,10 @@ def _run_command(args: Sequence[str] | None) -> int:
 
 
 class UntilClosed:
-    """A text stream that drops all output once its pipe is closed. All other attributes are the
-    stream's.
+    """A text stream that drops all output once its pipe is closed.
 
-    With a plain stream, the next line that a command prints would raise an error and end the
-    command's work.
+    All other attributes are the stream's. With a plain stream, the next line that a command prints
+    would raise an error and end the command's work.
     """
 
     def __init__(self, stream: TextIO) -> None:

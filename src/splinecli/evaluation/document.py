@@ -1,5 +1,4 @@
-"""The files that an evaluation writes: results.json, results.csv, tables, plots, and a report as
-one HTML file.
+"""The files that an evaluation writes: results, tables, plots, and a report in HTML.
 
 All functions take one evaluation, or several with the same methods that differ in n_lights,
 light_noise_deg or both.
@@ -64,8 +63,7 @@ Table = list[list[Cell]]  # a header row, then rows whose first cell is a header
 def html_report(
     evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, bytes]], notes: Sequence[str]
 ) -> str:
-    """Return the report of one evaluation, or of several that differ in the lights or the light
-    noise.
+    """Return the report of one evaluation, or of several with different lights or light noise.
 
     `figures` are pairs of a caption, which also serves as alternative text, and a PNG. `notes` are
     sentences about the captures.
@@ -143,8 +141,9 @@ def _summary(evaluations: Sequence[Evaluation]) -> Table:
 
 
 def _error_table(evaluation: Evaluation) -> Table:
-    """Return a table of methods by captures and the average: MAE and its standard deviation over
-    the trials.
+    """Return a table of methods by captures, with the average: MAE and its standard deviation.
+
+    The deviation is over the trials.
     """
     header, *rows = table_rows(evaluation)
     best = tables.best_cells([header, *rows])
@@ -178,8 +177,9 @@ def _seconds_table(evaluation: Evaluation) -> Table:
 
 
 def _matrix(methods: Sequence[str], comparisons: Sequence[ComparisonReport]) -> Table:
-    """Return a table of MAE differences, row method minus column method; significant ones are
-    marked.
+    """Return a table of MAE differences, row method minus column method.
+
+    Significant differences are marked.
     """
     cells = {}
     for c in comparisons:
@@ -239,8 +239,9 @@ TRIALS, REPORT, RESULTS, FIGURES = "trials.jsonl", "report.html", "results.json"
 
 
 def _make_plots(evaluations: Sequence[Evaluation]) -> dict[str, tuple[str, bytes]]:
-    """Return plots of the error against each setting that varies, as captions and PNGs by file
-    name.
+    """Return plots of the error against each setting that varies, by file name.
+
+    Each has a caption and a PNG.
     """
     plots: dict[str, tuple[str, bytes]] = {}
     if not set.intersection(*(set(evaluation.captures) for evaluation in evaluations)):
@@ -259,11 +260,10 @@ def write_results(
     figures: Sequence[CaptureFigure] | None,
     relit: Sequence[RelightingReport] | None = None,
 ) -> dict[str, Any]:
-    """Write all files, replacing an earlier evaluation (see new_files). The caller has locked the
-    folder.
+    """Write all files, replacing an earlier evaluation (see new_files).
 
-    If `figures` is None, the figures of an earlier evaluation are kept. Returns the content of
-    results.json.
+    The caller has locked the folder. If `figures` is None, the figures of an earlier evaluation are
+    kept. Returns the content of results.json.
     """
     document, plots = results_document(evaluations), _make_plots(evaluations)
     if relit is not None:
@@ -314,9 +314,7 @@ def results_document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
 
 
 def results_csv(evaluations: Sequence[Evaluation]) -> str:
-    """Return a header and a line for each result, with the names and values of `results` in
-    results.json.
-    """
+    """Return a header and a line for each result, as in `results` of results.json."""
     text = io.StringIO()
     records = _records(evaluations)
     for record in records:
@@ -328,8 +326,9 @@ def results_csv(evaluations: Sequence[Evaluation]) -> str:
 
 
 def _as_text_cell(value: Any) -> Any:
-    """Return a value as a one-line cell; an apostrophe marks it as text if a spreadsheet could read
-    a formula.
+    """Return a value as a one-line cell.
+
+    An apostrophe marks it as text if a spreadsheet could read it as a formula.
     """
     if not isinstance(value, str):
         return value

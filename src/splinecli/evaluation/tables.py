@@ -28,8 +28,7 @@ _SAME_DEG = 1e-6  # error maps are float32, so MAEs closer than this are conside
 
 
 def compare(evaluation: Evaluation) -> list[ComparisonReport]:
-    """Return the comparison of every pair of methods on every capture, then on the average over the
-    captures.
+    """Compare every pair of methods on every capture, then on the average over the captures.
 
     Trial t of the average is the mean of trial t over the captures. See trial_averages.
     """
@@ -152,8 +151,9 @@ _LATEX = str.maketrans(
 
 
 def table_rows(evaluation: Evaluation) -> list[list[str]]:
-    """Return a header row, then a row for each method: name, MAE on each capture, average; with two
-    decimals.
+    """Return a header row, then a row for each method: name, MAE on each capture, and average.
+
+    The errors have two decimals.
     """
     mae_deg = {(result.method, result.capture): result.mae_deg for result in evaluation.results}
     rows = [["method", *(printable(name) for name in evaluation.captures), AVERAGE]]
@@ -164,8 +164,9 @@ def table_rows(evaluation: Evaluation) -> list[list[str]]:
 
 
 def best_cells(rows: Sequence[Sequence[str]]) -> set[tuple[int, int]]:
-    """Return the (row, column) of the smallest printed values in each column; empty for a single
-    method.
+    """Return the (row, column) of the smallest printed values in each column.
+
+    The set is empty for a single method.
     """
     best = set()
     if len(rows) > 2:
@@ -178,9 +179,7 @@ def best_cells(rows: Sequence[Sequence[str]]) -> set[tuple[int, int]]:
 
 
 def caption(evaluation: Evaluation) -> str:
-    """Return a table's caption, with the protocol: "Mean angular error in degrees: 10 lights,
-    ...".
-    """
+    """Return a table's caption: "Mean angular error in degrees: 10 lights, ..."."""
     return f"Mean angular error in degrees: {protocol_in_words(evaluation.protocol)}."
 
 

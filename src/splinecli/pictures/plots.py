@@ -1,6 +1,4 @@
-"""Plots: light directions, observation maps, learning curves, and the maps of several methods side
-by side.
-"""
+"""Plots: light directions, observation maps, learning curves, and maps of several methods."""
 
 from __future__ import annotations
 
@@ -50,10 +48,10 @@ _STYLES = tuple(map(MethodStyle, _COLOURS, "osD^vXP*h"))
 
 
 def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
-    """Return the style of each method. It depends on the registry's order, so it is the same in
-    every plot.
+    """Return the style of each method.
 
-    Names that are not in the registry follow in their order.
+    It depends on the registry's order, so it is the same in every plot. Names that are not in the
+    registry follow in their order.
     """
     known = method_names()
     places = known + [name for name in methods if name not in known]
@@ -122,12 +120,12 @@ def observation_map_figure(
     title: str = "",
     grid: Grid = "even",
 ) -> bytes:
-    """Return a PNG file with a row for each of N pixels: sparse map, LI-Net's dense map, map of all
-    lights.
+    """Return a PNG file with a row of observation maps for each of N pixels.
 
-    Row 0 of a map is y = +1. The maps of a pixel share one frame, either the camera's or the
-    pixel's. Values are relative to the largest observation, from 0 to 1. Empty cells are gray; the
-    circle is the horizon.
+    The columns are the sparse map, the dense map of LI-Net, and the map of all lights. Row 0 of a
+    map is y = +1. The maps of a pixel share one frame, either the camera's or the pixel's. Values
+    are relative to the largest observation, from 0 to 1. Empty cells are gray; the circle is the
+    horizon.
 
     Args:
         sparse: (N, w, w), NaN in empty cells.
@@ -177,8 +175,7 @@ Columns = Mapping[str, Sequence[float | None]]
 
 
 def training_figure(columns: Columns) -> Figure:
-    """Return a matplotlib figure of the loss, the angular errors and the map errors against the
-    step.
+    """Return a figure of the loss, the angular errors and the map errors against the step.
 
     `columns` has the columns of metrics.csv by name, all of one length; None marks a value that was
     not computed.
@@ -226,13 +223,13 @@ def method_maps(
     *,
     title: str,
 ) -> bytes:
-    """Return a PNG file with a column for the ground truth and one for each method: normal map
-    above error map.
+    """Return a PNG file of the ground truth and the maps of several methods, side by side.
 
-    Normals have the colours (n + 1) / 2, errors the scale of colour_errors from 0 to TOP_DEG; other
-    pixels are white. The maps are cropped to the mask's bounding box. Small maps are enlarged by a
-    whole factor and large ones averaged, so that the picture stays below 4000 pixels wide. The MAE
-    below each method covers the pixels that have errors.
+    Each column has a normal map above an error map. Normals have the colours (n + 1) / 2, errors
+    the scale of colour_errors from 0 to TOP_DEG; other pixels are white. The maps are cropped to
+    the mask's bounding box. Small maps are enlarged by a whole factor and large ones averaged, so
+    that the picture stays below 4000 pixels wide. The MAE below each method covers the pixels that
+    have errors.
 
     The ground truth (H, W, 3) is unit, or zero where it is unknown; the mask (H, W) is not empty.
     Each method, in the order of the columns, has normals (H, W, 3) and errors (H, W), NaN in pixels
@@ -281,8 +278,9 @@ def method_maps(
 def _draw_bar(
     figure: Figure, left: int, bottom: int, height: int, text: int, *, side: int = -1
 ) -> None:
-    """Draw a vertical colour bar of errors, `text` pixels wide,
-    with labels and title on one side.
+    """Draw a vertical colour bar of errors, with labels and title on one side.
+
+    It is `text` pixels wide.
     """
     inset = text // 2  # room for half a label at either end
     length, edge = height - 2 * inset, left + text * (side > 0)
@@ -296,8 +294,7 @@ def _draw_bar(
 
 
 def error_map_picture(error_map_deg: Floats) -> Picture:
-    """Return an error map (H, W) in degrees as an RGB picture (H', W', 3) with a colour bar at its
-    right.
+    """Return an error map (H, W) in degrees as an RGB picture with a colour bar at its right.
 
     A map of fewer than 256 rows is enlarged by a whole factor while its width stays within 1024
     pixels, then padded to 256 rows.
@@ -382,8 +379,9 @@ def _write(
 
 
 def _text_height(width: int, lines: Sequence[str], *, most: int = 36) -> int:
-    """Return a text height in pixels at which each line fits into the width; short lines do not
-    fill it.
+    """Return a text height in pixels at which each line fits into the width.
+
+    Short lines do not fill it.
     """
     longest = max(18, *(len(line) for line in lines))
     # characters are 0.62 of their height wide
@@ -409,8 +407,9 @@ def _resize(picture: Picture, scale: float) -> Picture:
 
 
 def _colour_normals(normals: Floats, known: Bools) -> Picture:
-    """Return the colours (n + 1) / 2 of normals (H, W, 3), white where `known` is false, even if
-    NaN is there.
+    """Return the colours (n + 1) / 2 of normals (H, W, 3), white where `known` is false.
+
+    Unknown normals may be NaN.
     """
     colours = encode_picture(np.where(known[..., None], normals, 0), known, bits=8).astype(np.uint8)
     colours[~known] = 255

@@ -70,8 +70,9 @@ from splinecli.system.publishing import held_folder, is_plain
 
 @dataclass(frozen=True)
 class BatchItem:
-    """A capture of a batch. `missing` is the reason that it cannot be read if the folder does not
-    exist.
+    """A capture of a batch.
+
+    `missing` is the reason that it cannot be read if the folder does not exist.
     """
 
     folder: Path
@@ -114,8 +115,9 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[B
 
 
 def _own_path(folder: Path) -> Path:
-    """Return the same path for all spellings of a folder. A link keeps its name, because its
-    results use that name.
+    """Return the same path for all spellings of a folder.
+
+    A link keeps its name, because its results use that name.
     """
     try:
         return resolve(folder) if ".." in folder.parts else folder.absolute()
@@ -124,8 +126,9 @@ def _own_path(folder: Path) -> Path:
 
 
 def _batch_item(folder: Path) -> BatchItem:
-    """Return the capture in the folder. Raises UsageError for a value that belongs to another
-    option.
+    """Return the capture in the folder.
+
+    Raises UsageError for a value that belongs to another option.
     """
     # If a folder cannot be read, the error is reported when that capture is processed.
     name = folder.name
@@ -153,8 +156,9 @@ Status = Literal["done", "skipped", "changed", "missing", "failed"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of one capture. `skipped` results are up to date; `changed` ones are out of date and
-    were kept.
+    """Outcome of one capture.
+
+    `skipped` results are up to date; `changed` ones are out of date and were kept.
     """
 
     status: Status
@@ -202,8 +206,9 @@ def run_member(
 
 
 def _failure(member: BatchItem, error: Exception) -> Outcome:
-    """Return the outcome of a failed capture. Raises NoRoomError, because the other captures would
-    fail, too.
+    """Return the outcome of a failed capture.
+
+    Raises NoRoomError, because the other captures would fail, too.
     """
     trace = ""
     if is_out_of_memory(error):
@@ -240,12 +245,12 @@ class ChangedError(OutputError):
 def find_earlier(
     target: Path, folder: Path, options: InferOptions, warn: Callable[[str], object]
 ) -> dict[str, Any] | None:
-    """Return the report in `target` if its results match the capture in `folder` and the options;
-    None without results.
+    """Return the report in `target` if its results match the capture and the options.
 
-    If an interrupted run left partial results, `warn` receives a sentence about this. Raises
-    ChangedError for results of another capture or other options, InputError, or OutputError if
-    `target` is also the capture's folder, where the user's own files may have the names of results.
+    Return None without results. If an interrupted run left partial results, `warn` receives a
+    sentence about this. Raises ChangedError for results of another capture or other options,
+    InputError, or OutputError if `target` is also the capture's folder, where the user's own files
+    may have the names of results.
     """
     try:
         report = read_report(target)
@@ -294,10 +299,10 @@ def infer_batch(
     shard: Shard | None = None,
     cluster: ClusterOptions = HERE,
 ) -> Iterator[Outcome]:
-    """Run `infer_capture` on each folder and yield the outcomes, in order, or as they finish in
-    other processes.
+    """Run `infer_capture` on each folder and yield the outcomes.
 
-    With several captures, or if OUT/index.html already exists, that page is written at the end.
+    They come in order, or from other processes as they finish. With several captures, or if
+    OUT/index.html already exists, that page is written at the end.
 
     Args:
         folders: the captures. Duplicates are ignored.
@@ -407,8 +412,9 @@ def _infer(
 
 @lru_cache(maxsize=1)
 def _method(options: InferOptions, method: MethodOptions, sha256: str | None) -> Estimator:
-    """Return this worker's estimator, which takes a second to load. Unlike `method`, options ignore
-    the device.
+    """Return this worker's estimator, which takes a second to load.
+
+    Unlike `method`, options ignore the device.
     """
     estimator = make_method(options)
     found = None if estimator.weights is None else estimator.weights["sha256"]
@@ -423,9 +429,7 @@ def _method(options: InferOptions, method: MethodOptions, sha256: str | None) ->
 
 
 def worst_exit_code(codes: Iterable[int]) -> int:
-    """Return the exit code of a batch: 1 for a defect of splinecli, otherwise the highest exit
-    code.
-    """
+    """Return the exit code of a batch: 1 for a defect of splinecli, otherwise the highest code."""
     found = set(codes)
     return SplinecliError.exit_code if SplinecliError.exit_code in found else max(found, default=0)
 
@@ -437,8 +441,7 @@ def expected_bytes(member: BatchItem, options: InferOptions) -> float:
 
 
 def choose_workers(members: Sequence[BatchItem], options: InferOptions) -> int:
-    """Return the number of captures that this machine can compute in parallel, given its cores and
-    its memory.
+    """Return how many captures this machine can compute in parallel with its cores and memory.
 
     A GPU computes one capture at a time.
     """

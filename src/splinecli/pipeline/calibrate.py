@@ -40,8 +40,9 @@ OUTPUT_FILES = (
 
 
 def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
-    """Calibrate the lights, write OUTPUT_FILES and return the report. Raises InputError,
-    OutputError.
+    """Calibrate the lights, write OUTPUT_FILES and return the report.
+
+    Raises InputError, OutputError.
     """
     with held_folder(options.output, observer.warn):
         check_free(options.output, OUTPUT_FILES, overwrite=options.overwrite)

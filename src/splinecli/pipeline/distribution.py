@@ -1,5 +1,4 @@
-"""Map a function over items in other processes, either on this machine or on the workers of a Dask
-cluster.
+"""Map a function over items in other processes, on this machine or on a Dask cluster.
 
 Workers receive paths and return reports; arrays are never transferred. Dask repeats an item if its
 worker is lost.
@@ -51,8 +50,7 @@ SAME_VERSIONS = "Install the same versions on all workers and the scheduler"
 
 @contextmanager
 def connected(options: ClusterOptions) -> Iterator[Client]:
-    """Yield a Dask client, connected to a new cluster of processes on this machine or to a running
-    cluster.
+    """Yield a Dask client of a new cluster on this machine, or of a running cluster.
 
     Raises UsageError if Dask is not installed, or no scheduler answers at the address.
     """
@@ -158,8 +156,9 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
 
 
 def _address(text: str) -> str:
-    """Return the address of a scheduler, reading the scheduler file if one is given. Raises
-    UsageError.
+    """Return the address of a scheduler, reading the scheduler file if one is given.
+
+    Raises UsageError.
     """
     from distributed.comm.registry import backends
 
@@ -177,16 +176,15 @@ def _address(text: str) -> str:
 
 
 class LostError(SplinecliError):
-    """A worker was lost, or has too little memory, so this item failed; other items may still
-    succeed.
+    """An item failed because its worker was lost or has too little memory.
+
+    Other items may still succeed.
     """
 
 
 @dataclass(frozen=True)
 class WorkItem:
-    """The arguments of Work.do, a name for messages, and the memory in bytes that the item
-    needs.
-    """
+    """The arguments of Work.do, a name for messages, and the memory needed in bytes."""
 
     args: tuple[Any, ...]
     name: str
@@ -209,8 +207,9 @@ class Work:
     versions: dict[str, str] = field(default_factory=_versions)  # of packages that must match
 
     def enter(self) -> None:
-        """Prepare this worker. Raises UsageError or InputError if it is incompatible with the
-        command.
+        """Prepare this worker.
+
+        Raises UsageError or InputError if it is incompatible with the command.
         """
         for package, found in _versions().items():
             if found != (expected := self.versions[package]):
@@ -260,8 +259,9 @@ def _do(work: Work, *args: Any) -> Any:
 
 @dataclass
 class Distributor:
-    """Assigns items to the workers of a Dask cluster, at most one at a time each. Workers may join
-    and leave.
+    """Assigns items to the workers of a Dask cluster, at most one at a time each.
+
+    Workers may join and leave.
     """
 
     client: Client
@@ -334,8 +334,9 @@ class Distributor:
                 yield from self._take_result(self._done.get(timeout=_LOOK_SECONDS))
 
     def _workers(self) -> dict[str, dict[str, Any]]:
-        """Return Dask's information on the usable workers. Raises SplinecliError if the scheduler
-        is lost.
+        """Return Dask's information on the usable workers.
+
+        Raises SplinecliError if the scheduler is lost.
         """
         try:
             found = dict(self.client.scheduler_info(n_workers=-1)["workers"])
@@ -411,11 +412,10 @@ def _scheduler_lost() -> SplinecliError:
 def distributor(
     do: Callable[..., Any], output: Path, options: ClusterOptions, observer: Observer
 ) -> Iterator[Distributor]:
-    """Yield a Distributor with a connection to its workers. Raises UsageError as `connected` does,
-    or OutputError.
+    """Yield a Distributor with a connection to its workers.
 
-    The output folder, which is created if needed, serves to check that the workers use the same
-    storage.
+    Raises UsageError as `connected` does, or OutputError. The output folder, which is created if
+    needed, serves to check that the workers use the same storage.
     """
     probe = output / f".{uuid.uuid4().hex}{UNFINISHED}"
     with ExitStack() as stack:

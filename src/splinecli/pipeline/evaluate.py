@@ -44,9 +44,7 @@ Found = TypeVar("Found")
 
 
 class EvaluateOutcome(NamedTuple):
-    """One evaluation for each protocol, the content of results.json, warnings, and what could not
-    be drawn or relit.
-    """
+    """The evaluations by protocol, results.json, warnings, and failed figures or relightings."""
 
     evaluations: list[Evaluation]
     document: dict[str, Any]
@@ -133,8 +131,9 @@ def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> No
 def _try_each(
     label: str, tasks: Sequence[Callable[[Advance], Found]], observer: Observer
 ) -> tuple[list[Found], list[str]]:
-    """Return the results of tasks, each given the function that counts its progress, and why others
-    failed.
+    """Return the results of the tasks that succeed, and why the others failed.
+
+    Each task is given the function that counts its progress.
     """
     found: list[Found] = []
     problems: list[str] = []
@@ -155,8 +154,9 @@ def _score_on_workers(
     observer: Observer,
     draws: Sequence[DrawTask],
 ) -> Iterator[tuple[DrawTask, Scored]]:
-    """Yield the draws with their scores as they finish, one item per draw. Only this process writes
-    to the store.
+    """Yield the draws with their scores as they finish, one item per draw.
+
+    Only this process writes to the store.
 
     Raises LostError if the workers of a draw were lost, after all others were scored; or see
     Distributor.run.
@@ -186,10 +186,10 @@ def _score(
 def _scorer(
     _command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions
 ) -> Callable[[DrawTask], Scored]:
-    """Return the function that scores draws of the worker's current command, and keeps the last
-    capture in memory.
+    """Return the function that scores draws of the worker's current command.
 
-    It is not reused by other commands, because files may change in between.
+    It keeps the last capture in memory. It is not reused by other commands, because files may
+    change in between.
     """
     estimators = {name: make_estimator(name, options) for name, _ in fingerprints}
     for name, expected in fingerprints:

@@ -1,5 +1,6 @@
-"""Detect incoming captures once they are complete: folders of images, and films, whose frames are
-extracted.
+"""Detect captures once they are complete: folders of images, and films.
+
+The frames of films are extracted.
 """
 
 import json
@@ -31,13 +32,12 @@ _FRAME = re.compile(r"frame-\d{6,}\.png")
 def unpacked(
     capture: Path, output: Path, reading: ReadingOptions, observer: Observer, *, redo: Redo
 ) -> Path:
-    """Return the capture; for a film, the folder in `output` with its frames, which are extracted
-    if needed.
+    """Return the capture or, for a film, the folder in `output` with its frames.
 
-    `redo` decides whether the frames of an earlier film are kept, replaced if the film differs, or
-    extracted again. Raises UsageError without --lights estimate, InputError if the film cannot be
-    read, or its light does not move, or OutputError if the folder contains frames from another
-    film, or other files, or the frames cannot be written.
+    The frames are extracted if needed. `redo` decides whether the frames of an earlier film are
+    kept, replaced if the film differs, or extracted again. Raises UsageError without --lights
+    estimate, InputError if the film cannot be read, or its light does not move, or OutputError if
+    the folder contains frames from another film, or other files, or the frames cannot be written.
     """
     if not is_film(capture):
         return capture
@@ -114,9 +114,7 @@ SECONDS_BETWEEN_FILES = 60.0
 
 @dataclass
 class _Seen:
-    """The contents of a capture, the time of the last change, and whether these contents were
-    returned.
-    """
+    """The contents of a capture, when they last changed, and whether they were returned."""
 
     stamp: Stamp
     since: float
@@ -204,8 +202,7 @@ def _changed(folder: str) -> int:
 
 
 def _stamp(capture: Path) -> tuple[Stamp, dict[str, int]]:
-    """Return the stamp of a film, or of all files in a folder and its subfolders, and the folders;
-    see _Seen.
+    """Return the stamp of a film or of all files below a folder, and the folders; see _Seen.
 
     Files that disappear in the meantime are ignored.
     """

@@ -1,5 +1,6 @@
-"""The options of `infer`, `watch` and `info` as frozen records, which can be pickled and converted
-to JSON.
+"""The options of `infer`, `watch` and `info` as frozen records.
+
+They can be pickled and converted to JSON.
 """
 
 # The options form a table: name and type, then panel, help text and kind of value.
@@ -56,8 +57,9 @@ SMALLEST_PIXEL_MM, LARGEST_PIXEL_MM = 1e-6, 1e6
 
 
 def complete_weights() -> list[str]:
-    """Return the names of the shipped weights. If none starts with the typed text, the shell
-    completes file names.
+    """Return the names of the shipped weights.
+
+    If none starts with the typed text, the shell completes file names.
     """
     # The module that usually reads this file imports torch, which is too slow for shell completion.
     return list(
@@ -134,8 +136,9 @@ def parse_workers(text: str) -> int:
 
 
 class WorkerOptions(Record, frozen=True, kw_only=True):
-    """The number of local processes that work on the items of a command; 0 means as many as the
-    machine can use.
+    """The number of local processes for the items of a command.
+
+    0 means as many as the machine can use.
     """
 
     workers: int = option(
@@ -149,9 +152,7 @@ class WorkerOptions(Record, frozen=True, kw_only=True):
 
 
 class ClusterOptions(WorkerOptions, frozen=True, kw_only=True):
-    """Where the items of a command are processed: in this process, in other local processes, or on
-    a Dask cluster.
-    """
+    """Where the items of a command are processed: here, in other processes, or on a cluster."""
 
     # the address or the scheduler file of a Dask scheduler
     address: str | None = option(
@@ -166,8 +167,7 @@ class ClusterOptions(WorkerOptions, frozen=True, kw_only=True):
     CONFLICTS = (("workers", "address", "Leave --workers out: the cluster has workers of its own"),)
 
     def on_cores(self, n_items: int | None = None) -> ClusterOptions | None:
-        """Return these options with 0 replaced by one process per core, limited to one process per
-        item.
+        """Return these options with one process per core instead of 0, at most one per item.
 
         Return None if other processes would not be faster than this one.
         """
@@ -358,9 +358,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
         )
 
     def check_files(self) -> None:
-        """Raise InputError if a file named in the options does not exist, or --flat-field contains
-        no images.
-        """
+        """Raise InputError if a file is missing, or the folder of --flat-field has no images."""
         intensities = None if self.intensities == EQUAL else self.intensities
         for name in (
             *(self.light_file, self.light_positions, intensities, self.camera_matrix),
@@ -422,8 +420,9 @@ def parse_indices(text: str, title: str) -> tuple[int, ...]:
 
 
 class InferOptions(ReadingOptions, frozen=True, kw_only=True):
-    """The options of `infer`; see its help. Raises UsageError if a value is invalid or two options
-    conflict.
+    """The options of `infer`; see its help.
+
+    Raises UsageError if a value is invalid or two options conflict.
     """
 
     # The defaults follow. light_indices are zero-based. map_scales are names of maps and the values
@@ -573,8 +572,9 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
         return MethodOptions(self.weights, device=self.device, precision=self.precision)
 
     def check_files(self) -> None:
-        """See ReadingOptions. Also raise UsageError if a package required by the options is not
-        installed.
+        """See ReadingOptions.
+
+        Also raise UsageError if a package required by the options is not installed.
         """
         super().check_files()
         check_exr(self.formats)
@@ -611,9 +611,7 @@ class Shard(NamedTuple):
 
 
 class BatchOptions(Record, frozen=True, kw_only=True):
-    """The captures of `infer`, whether existing results are computed again,
-    and the printed output.
-    """
+    """The captures of `infer`, what is computed again, and the printed output."""
 
     captures: tuple[Path, ...] = option(
         "Arguments",

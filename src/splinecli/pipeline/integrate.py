@@ -53,8 +53,7 @@ def view_of_report(
     camera_matrix: Floats | None = None,
     pixel_size_mm: float | None = None,
 ) -> tuple[Float64Array | None, float | None]:
-    """Return the camera matrix and the pixel size in millimetres of the normal map described by a
-    report of `infer`.
+    """Return the camera matrix and the pixel size in millimetres from a report of `infer`.
 
     `camera_matrix` and `pixel_size_mm` refer to the photographs and override the values in the
     report. Raises KeyError, TypeError, ValueError or UsageError if the document is not a report
@@ -78,8 +77,9 @@ def view_of_report(
 
 
 def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
-    """Integrate a normal map, write the surface and its report, and return the report. Raises
-    SplinecliError.
+    """Integrate a normal map, write the surface and its report, and return the report.
+
+    Raises SplinecliError.
     """
     if options.decimate is not None:
         import_extra("fast_simplification", "mesh")
@@ -157,8 +157,9 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
 def _read_textures(
     options: IntegrateOptions, shape: tuple[int, ...]
 ) -> tuple[Path | None, Textures]:
-    """Return the image of the colours, if there is one, and the textures (H, W): of the colours
-    that are given, or of the maps in the folder.
+    """Return the image of the colours, if any, and the textures (H, W).
+
+    They come from the options, or from the maps in the folder.
     """
     folder, picture = options.normals, options.colours
     material = MAPS["material"].files
@@ -181,8 +182,9 @@ def _read_textures(
 
 
 def _read_picture(path: Path, shape: tuple[int, ...]) -> Picture:
-    """Return an image as a picture (H, W, 3) of 8 bits. Raises InputError if its size is not (H,
-    W).
+    """Return an image as a picture (H, W, 3) of 8 bits.
+
+    Raises InputError if its size is not (H, W).
     """
     image = np.broadcast_to(read_image(path, ExpectedSize(shape, "the normal map")), (*shape, 3))
     return np.asarray(np.rint(255 * image.clip(0, 1)), np.uint8)
@@ -204,8 +206,9 @@ class _Listing(Struct):
 
 
 def _earlier_files(folder: Path) -> list[str]:
-    """Return the surface files that an earlier `integrate` wrote to the folder; files from `infer`
-    are kept.
+    """Return the surface files that an earlier `integrate` wrote to the folder.
+
+    Files from `infer` are kept.
     """
     try:
         named = read_json(folder / SURFACE_REPORT, _Listing).files
@@ -231,9 +234,7 @@ def _find_normal_map(folder: Path) -> Path:
 
 
 def _report_of(path: Path) -> dict[str, Any] | None:
-    """Return the report of the `infer` run that wrote a normal map, or None if it has another
-    origin.
-    """
+    """Return the report of the run that wrote a normal map, or None without one."""
     try:
         report: dict[str, Any] = read_json(path.parent / REPORT)
         if path.name not in report["files"]:

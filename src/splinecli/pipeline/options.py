@@ -1,5 +1,6 @@
-"""The options of the commands that are not for individual captures, as frozen records. See their
-help.
+"""The options of the commands that are not for individual captures, as frozen records.
+
+See their help.
 """
 
 # The options form a table: name and type, then panel, help text and kind of value.
@@ -142,8 +143,9 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
 
 
 def parse_level(text: str) -> tuple[tuple[int, int], ...]:
-    """Return the points in a text such as "10,20 90,20 50,80", or () for "plane". Raises
-    UsageError.
+    """Return the points in a text such as "10,20 90,20 50,80", or () for "plane".
+
+    Raises UsageError.
     """
     if text.strip() == "plane":
         return ()
@@ -449,6 +451,7 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
     @property
     def protocols(self) -> list[Protocol]:
         """One protocol for each combination of number of lights and light noise.
+
         Raises UsageError.
         """
         from splinecli.lights.light_fit import LIGHT_ERROR_DEG

@@ -115,8 +115,9 @@ class _RecordMeta(StructMeta):
 
 
 class Record(Struct, metaclass=_RecordMeta, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A frozen record of options, whose fields are validated. Raises UsageError for an invalid
-    value, or for two options that cannot be used together.
+    """A frozen record of options, whose fields are validated.
+
+    Raises UsageError for an invalid value, or for two options that cannot be used together.
     """
 
     CONFLICTS: ClassVar[Conflicts] = ()
@@ -153,15 +154,17 @@ class Record(Struct, metaclass=_RecordMeta, frozen=True, kw_only=True, forbid_un
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Return the record from the result of `as_dict`. Raises UsageError for an unknown name or
-        an invalid value.
+        """Return the record from the result of `as_dict`.
+
+        Raises UsageError for an unknown name or an invalid value.
         """
         return cls(**settings(cls, values, "option", UsageError))
 
     @classmethod
     def from_arguments(cls, given: dict[str, Any]) -> Self:
-        """Remove the record's command-line values from `given`, and return the record. Raises
-        UsageError.
+        """Remove the record's command-line values from `given`, and return the record.
+
+        Raises UsageError.
         """
         values: dict[str, Any] = {}
         for name, kind in field_types(cls).items():
@@ -222,10 +225,10 @@ def settings(
 def converted(
     kind: Any, value: Any, title: str, error: type[SplinecliError], *, strict: bool = True
 ) -> Any:
-    """Convert a value to a type, such as a list to a tuple. Raises the given error, which begins
-    with the title.
+    """Convert a value to a type, such as a list to a tuple.
 
-    Unless `strict` is set, numbers may be given as text.
+    Raises the given error, which begins with the title. Unless `strict` is set, numbers may be
+    given as text.
     """
     if isinstance(kind, type) and is_dataclass(kind) and isinstance(value, kind):
         return value
@@ -262,9 +265,7 @@ def _metadata(kind: Any) -> Iterator[Any]:
 
 
 def plain(kind: Any) -> Any:
-    """Return a type without annotations; Path for a path that is stored as text, and a list for a
-    tuple.
-    """
+    """Return a type without annotations, with Path for a stored path and list for a tuple."""
     if get_origin(kind) is Annotated:
         return Path if PATH in kind.__metadata__ else plain(get_args(kind)[0])
     if get_origin(kind) in (Union, types.UnionType):
@@ -312,9 +313,7 @@ def number_of(kind: Any) -> type | None:
 
 
 def complete_list(items: Iterable[str]) -> Callable[[str], list[str]]:
-    """Return the completions of a list "a,b": the typed items, followed by each possible item after
-    the last comma.
-    """
+    """Return a function that completes a list "a,b" by each possible next item."""
 
     def complete(incomplete: str) -> list[str]:
         *typed, _ = incomplete.split(",")

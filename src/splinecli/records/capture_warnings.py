@@ -332,9 +332,7 @@ def eight_bit(any_8_bit: bool) -> list[CaptureWarning]:
 
 
 def estimated_lights(errors_deg: Float64Array) -> CaptureWarning:
-    """Report that the light directions were estimated from the images, with expected errors (F,) in
-    degrees.
-    """
+    """Report that the light directions were estimated, with expected errors (F,) in degrees."""
     return CaptureWarning(
         ESTIMATED_LIGHTS,
         "The light directions were estimated from the images. Their expected error is"

@@ -1,5 +1,6 @@
-"""The documents that commands write and print as JSON; docs/reports.schema.json is generated from
-them.
+"""The documents that commands write and print as JSON, from which the schema is generated.
+
+It is docs/reports.schema.json.
 """
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-"""The files that splinecli writes for users: their names, and one row of MAPS for each optional map
-of `infer`.
+"""The files that splinecli writes for users, and one row of MAPS for each optional map.
 
 The row determines how the map is computed, written, read, drawn and shown, how much memory it
 needs, and that its pictures are not read as photographs. The functions that make and draw a map are
@@ -108,8 +107,9 @@ class OutputMap:
 
 @dataclass(frozen=True)
 class MapPart:
-    """A map that consists of some channels of another one, (H, W) if there is only one, and is
-    written with it.
+    """Some channels of a map that are written with it as a map of their own.
+
+    Its shape is (H, W) if there is only one.
     """
 
     name: str
@@ -200,8 +200,9 @@ MAPS = {row.name: row for row in _ROWS}
 
 
 def own_files() -> list[str]:
-    """Return the names of all files that `infer` and `integrate` may write to a folder, except
-    FOUND_LIGHTS.
+    """Return the names of all files, except FOUND_LIGHTS, that may be written to a folder.
+
+    The commands are `infer` and `integrate`.
     """
     maps = (name for row in MAPS.values() for name in row.files.values())
     surface = (*file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS, SURFACE_REPORT)

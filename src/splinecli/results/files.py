@@ -1,6 +1,4 @@
-"""Write the results of `infer` for a capture: the report and the files,
-either all of them or none.
-"""
+"""Write the results of `infer` for a capture, either all of them or none."""
 
 from __future__ import annotations
 
@@ -102,9 +100,7 @@ def report_of(
 
 
 def peak_memory_mib() -> int | None:
-    """Return the peak memory usage of this process in MiB, or None if the system does not report
-    it.
-    """
+    """Return the peak memory usage of this process in MiB, or None if it is not reported."""
     try:
         import resource
     except ImportError:  # Windows
@@ -127,12 +123,11 @@ UNUSABLE = (OSError, ValueError, KeyError, TypeError, AttributeError)
 def write_estimate(
     report: dict[str, Any], folder: Path, files: Iterable[tuple[str, Content]], clock: Clock
 ) -> dict[str, Any]:
-    """Write the results of a capture to `folder` and return the finished report; `report` comes
-    from report_of.
+    """Write the results of a capture to `folder` and return the finished report.
 
-    The files, which are named in own_files() and FOUND_LIGHTS, replace the files of an earlier run
-    (see new_files). The caller has locked the folder. Writing is the clock's last stage. Raises
-    OutputError if a file cannot be written.
+    `report` comes from report_of. The files, which are named in own_files() and FOUND_LIGHTS,
+    replace the files of an earlier run (see new_files). The caller has locked the folder. Writing
+    is the clock's last stage. Raises OutputError if a file cannot be written.
     """
     # The user may have edited the mask of an earlier run and passed it to this run: keep it.
     stale = {*output_files.own_files(), *own_light_files(folder)} - {output_files.FOUND_MASK}
@@ -152,9 +147,7 @@ def write_estimate(
 
 
 def own_light_files(folder: Path) -> list[str]:
-    """Return the FOUND_LIGHTS in a folder of results that, according to its report, an earlier run
-    wrote.
-    """
+    """Return the FOUND_LIGHTS that an earlier run wrote to a folder, according to its report."""
     try:
         return [name for name in output_files.FOUND_LIGHTS if name in read_report(folder)["files"]]
     except UNUSABLE:
@@ -162,10 +155,9 @@ def own_light_files(folder: Path) -> list[str]:
 
 
 def read_report(folder: Path) -> dict[str, Any]:
-    """Return the report in a folder of results if its list of files is correct. Links are not
-    followed.
+    """Return the report in a folder of results if its list of files is correct.
 
-    The rest of the report is not checked.
+    Links are not followed. The rest of the report is not checked.
 
     Raises:
         UnfinishedError: the report or a file is missing, or a file has another size.
@@ -193,9 +185,7 @@ def read_report(folder: Path) -> dict[str, Any]:
 
 
 def normal_files(estimate: NormalEstimate, formats: Sequence[str], convention: Convention) -> Files:
-    """Yield the normal map in the given formats, which are keys of NORMALS, and the error map if
-    available.
-    """
+    """Yield the normal map in these formats (keys of NORMALS), and the error map if known."""
     for form in formats:
         yield output_files.NORMALS[form], encode_normals(estimate, form, convention)
     if estimate.error_map_deg is not None:
@@ -203,11 +193,10 @@ def normal_files(estimate: NormalEstimate, formats: Sequence[str], convention: C
 
 
 def encode_normals(estimate: NormalEstimate, form: str, convention: Convention) -> Content:
-    """Return the file of the normal map: a 16-bit or 8-bit PNG picture, or float32 NPY, TIFF or
-    EXR.
+    """Return the file of the normal map: a PNG picture, or float32 NPY, TIFF or EXR.
 
-    EXR has the same colours as the pictures, (n + 1) / 2 and black outside the mask, because
-    renderers expect them.
+    The picture has 16 or 8 bits. EXR has the same colours as the pictures, (n + 1) / 2 and black
+    outside the mask, because renderers expect them.
     """
     if form in ("png", "png8"):
         picture = encode_picture(
@@ -233,9 +222,7 @@ def encode_normals(estimate: NormalEstimate, form: str, convention: Convention) 
 
 
 def light_files(capture: Capture, plot: bytes) -> Files:
-    """Yield the lights estimated from the images, in the format of `--lights` and `--intensities`,
-    and their plot.
-    """
+    """Yield the lights estimated from the images, as `--lights` reads them, and their plot."""
     yield output_files.FOUND_DIRECTIONS, rows_text(capture.light_directions)
     if (intensities := capture.estimated_intensities) is not None:
         text = rows_text(np.repeat(intensities[:, None], 3, axis=1))

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 
 
 def chosen_maps(names: Collection[str], *, page: bool = False) -> list[OutputMap]:
-    """Return the rows with these names and the rows shown on the page, with the most
-    memory-intensive ones last.
+    """Return the rows with these names and the rows shown on the page.
+
+    The rows that take the most memory come last.
     """
     rows = [row for row in MAPS.values() if row.name in names or (page and row.caption)]
     return sorted(rows, key=lambda row: row.bytes_per_pixel)
@@ -34,8 +35,9 @@ def make_map(
     estimate: NormalEstimate,
     progress: Progress = lambda: None,
 ) -> Float32Array | None:
-    """Return the values of a map, or None if the capture or the method does not provide it. Raises
-    InputError.
+    """Return the values of a map, or None if the capture or the method does not provide it.
+
+    Raises InputError.
     """
     return MAP_FUNCTIONS[row.name].make(source, estimate, progress)
 
@@ -54,9 +56,7 @@ def map_files(
     *,
     scale: float | None = None,
 ) -> Iterator[tuple[str, Content]]:
-    """Yield the files of a map: NPY and PNG whenever the map has them, TIFF and EXR only if they
-    are requested.
-    """
+    """Yield the files of a map; TIFF and EXR only if they are requested."""
     for part in row.parts:
         channels = values[..., part.first : part.last]
         if part.has_values:

@@ -33,10 +33,9 @@ def base_colour_picture(base_colour: Float32Array, _: Bools) -> Picture:
 
 
 def gloss_picture(values: Float32Array, mask: Bools) -> Picture:
-    """Return glTF's texture (H, W, 3) of roughness and metalness (H, W, 2): in green and blue,
-    linear.
+    """Return glTF's linear texture (H, W, 3) of roughness and metalness (H, W, 2).
 
-    Red is for occlusion in glTF; it is white in the mask.
+    Roughness is in green, metalness in blue. Red is for occlusion in glTF; it is white in the mask.
     """
     return np.asarray(
         np.rint(255 * np.dstack((mask.astype(np.float32), values)).clip(0, 1)), np.uint8
@@ -54,8 +53,9 @@ def gloss_picture(values: Float32Array, mask: Bools) -> Picture:
     metallic_roughness=gloss_picture,
 )
 def material(source: CaptureSource, estimate: NormalEstimate, progress: Progress) -> Float32Array:
-    """Return base colour, roughness, metalness, specular reflection and confidence, (H, W, 7), zero
-    outside the mask.
+    """Return the material (H, W, 7) of a capture, zero outside the mask.
+
+    The channels are base colour, roughness, metalness, specular reflection and confidence.
 
     Raises InputError if an image can no longer be read, or there are too few lights.
     """
@@ -131,8 +131,7 @@ PAGE_CAPTIONS = {
 
 
 def page_pictures(material: Float32Array) -> dict[str, Picture]:
-    """Return the pictures from which the page draws a material (H, W, 7), by their names in
-    PAGE_CAPTIONS.
+    """Return the pictures, named in PAGE_CAPTIONS, from which the page draws a material (H, W, 7).
 
     The base colour and the reflectance, usually 4 %, are encoded in sRGB, roughness and metalness
     are linear.

@@ -1,6 +1,4 @@
-"""HTML pages of results: one with interactive relighting for each capture, and their overview,
-index.html.
-"""
+"""HTML pages of results: one for each capture, with relighting, and their index.html."""
 
 from __future__ import annotations
 
@@ -34,8 +32,9 @@ def picture_url(file: bytes, kind: str = "png") -> str:
 
 
 def render(template: str, **values: object) -> str:
-    """Return the page rendered from a template and its values. Values are escaped; a missing value
-    is an error.
+    """Return the page rendered from a template and its values.
+
+    Values are escaped; a missing value is an error.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -145,12 +144,12 @@ def result_page(
 
 
 def split_normals(normals: Float32Array, mask: Bools) -> tuple[Picture, Picture]:
-    """Return unit normals (H, W, 3) as two RGB pictures: the upper 8 bits of (n + 1) / 2, and the
-    LOW_BITS below.
+    """Return unit normals (H, W, 3) as two RGB pictures, of upper and lower bits.
 
-    The first is the usual picture of a normal map. Both are black outside the mask (H, W). A pixel
-    that is black in the first picture must be outside, because no unit normal is near (-1, -1, -1).
-    The pictures have no alpha channel, because a browser would multiply the colours by it.
+    They are the upper 8 bits of (n + 1) / 2, and the LOW_BITS below. The first is the usual picture
+    of a normal map. Both are black outside the mask (H, W). A pixel that is black in the first
+    picture must be outside, because no unit normal is near (-1, -1, -1). The pictures have no alpha
+    channel, because a browser would multiply the colours by it.
     """
     codes = np.rint((normals + 1) / 2 * _LARGEST_CODE).astype(np.uint16) * mask[..., None]
     return (codes >> LOW_BITS).astype(np.uint8), (codes & (2**LOW_BITS - 1)).astype(np.uint8)
@@ -159,8 +158,9 @@ def split_normals(normals: Float32Array, mask: Bools) -> tuple[Picture, Picture]
 def _first_pictures(
     maps: Mapping[str, Picture], normals: Float32Array, mask: Bools
 ) -> dict[str, Picture]:
-    """Return pictures of at most 100,000 pixels of the maps, which a browser shows while it loads
-    the others.
+    """Return small pictures of the maps, which a browser shows while it loads the others.
+
+    They have at most 100,000 pixels.
     """
     import cv2
 
@@ -173,10 +173,10 @@ def _first_pictures(
 
 
 def _reduce(values: Float32Array, known: Bools, largest: int) -> tuple[Float32Array, Bools]:
-    """Return values (H, W, C) and their mask, reduced to at most `largest` pixels and sides of at
-    most LONGEST_SIDE.
+    """Return values (H, W, C) and their mask, reduced in size.
 
-    A reduced value is the mean of the known values in its area, and is known if one of them is.
+    The result has at most `largest` pixels, and sides of at most LONGEST_SIDE. A reduced value is
+    the mean of the known values in its area, and is known if one of them is.
     """
     import cv2
 
@@ -198,8 +198,9 @@ def _size(mask: Bools) -> str:
 
 
 def _facts(report: Mapping[str, Any], reduced: str | None) -> list[tuple[str, str]]:
-    """Return pairs of terms and values; `reduced` is the size of the page's maps if they were
-    reduced.
+    """Return pairs of terms and values.
+
+    `reduced` is the size of the maps on the page if they were reduced.
     """
     weights, expected = report["weights"], report["expected_under_5"]
     # up to this page
@@ -256,9 +257,7 @@ class IndexEntry(NamedTuple):
 
     @classmethod
     def of(cls, report: Mapping[str, Any]) -> IndexEntry:
-        """Return the entry for a report (see report_of), or for a document with `capture` and
-        `error`.
-        """
+        """Return the entry for a report, or for a document with `capture` and `error`."""
         if "error" in report:
             return cls(IndexRow(report["capture"], error=report["error"]))
         errors, expected = report["angular_error_deg"], report["expected_under_5"]
@@ -277,9 +276,7 @@ class IndexEntry(NamedTuple):
 
 
 def index_page(entries: Sequence[IndexEntry], output: Path) -> str:
-    """Return the overview page with small normal maps and links to the files, for the folder above
-    the captures.
-    """
+    """Return the overview page of the folder above the captures, with thumbnails and links."""
     rows = []
     for row, files, words in entries:
         # Quote the bytes, because a folder's name may not be valid text.
@@ -297,8 +294,7 @@ def index_page(entries: Sequence[IndexEntry], output: Path) -> str:
 
 
 def _thumbnail(path: Path) -> str | None:
-    """Return a picture of at most 256 x 192 pixels as a JPEG data URL, or None if it cannot be
-    read.
+    """Return a picture of at most 256 x 192 pixels as a JPEG data URL, or None if unreadable.
 
     This is twice its size on the page, for sharp screens.
     """
@@ -322,8 +318,9 @@ def _thumbnail(path: Path) -> str | None:
 
 
 def with_earlier(entries: Sequence[IndexEntry], folder: Path) -> list[IndexEntry]:
-    """Return the entries, followed by entries for other captures with results in the folder, sorted
-    by name.
+    """Return the entries, followed by those of other captures with results in the folder.
+
+    The others are sorted by name.
     """
     names = {entry.row.capture for entry in entries}
     earlier = []
@@ -352,8 +349,9 @@ def has_index(folder: Path) -> bool:
 
 
 def check_index_free(folder: Path, *, overwrite: bool) -> None:
-    """Raise OutputError if the folder has an index.html that splinecli did not write and may not
-    replace.
+    """Raise OutputError if the folder has an index.html that may not be replaced.
+
+    That is one which splinecli did not write.
     """
     path = folder / INDEX
     if path.is_dir() or (path.exists() and not overwrite and not has_index(folder)):

@@ -116,8 +116,7 @@ class BilateralEquations:
 
 
 class LaplacianSolver:
-    """Solve the normal equations of pairs of neighbours again and again, with other weights each
-    time.
+    """Solve the normal equations of pairs of neighbours repeatedly, with changing weights.
 
     The matrix is a weighted Laplacian of the graph of pixels. The solver has conjugate gradients
     with an algebraic multigrid preconditioner. Its setup costs as much as several solves, so it is
@@ -148,12 +147,12 @@ class LaplacianSolver:
         pull: Float64Array | float = 0.0,
         distance: Float64Array | float = 0.0,
     ) -> Float64Array:
-        """Return the change of heights (P,) that minimises the sum of squares, to a relative
-        residual of `precision`.
+        """Return the change of heights (P,) that minimises the sum of squares.
 
-        Weights (E,) are half the second derivative by the gap of each pair, flows (E,) half the
-        first. `pull` (P,) is half the second derivative by the height of each pixel, of the cost
-        that pulls it to a known height, and `distance` (P,) has the heights above these known ones.
+        The solution is accurate to a relative residual of `precision`. Weights (E,) are half the
+        second derivative by the gap of each pair, flows (E,) half the first. `pull` (P,) is half
+        the second derivative by the height of each pixel, of the cost that pulls it to a known
+        height, and `distance` (P,) has the heights above these known ones.
         """
         from pyamg import ruge_stuben_solver
         from scipy.sparse import csr_matrix

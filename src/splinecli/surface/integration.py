@@ -46,8 +46,9 @@ def integrate_normals(
     prior_detail: float | None = None,
     progress: Progress = ignore,
 ) -> Float64Array:
-    """Integrate a normal map (H, W, 3) to a height or depth map (H, W), float64, NaN outside the
-    mask.
+    """Integrate a normal map (H, W, 3) into a height or depth map (H, W).
+
+    The result is float64, NaN outside the mask.
 
     For an orthographic camera, the result is the height towards the camera in pixels. With a camera
     matrix, it is the positive depth along the viewing axis, of unknown scale. Normals do not fix
@@ -184,11 +185,11 @@ def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> F
 def _normals_of(
     blocks: Blocks, normals: Float64Array, mask: Bools, *, keep_edges: bool
 ) -> Float64Array:
-    """Return the normals (p, 3) of blocks from their pixels' normals (P, 3): of the mean slope, or
-    the steepest one.
+    """Return the normals (p, 3) of blocks from those of their pixels (P, 3).
 
-    With keep_edges, a block that contains an edge has the steepest normal, which belongs to the
-    rim. The mean over an edge would be a slope that joins the two separate sides.
+    They are the normals of the mean slope, or the steepest ones. With keep_edges, a block that
+    contains an edge has the steepest normal, which belongs to the rim. The mean over an edge would
+    be a slope that joins the two separate sides.
     """
     slopes = normals / np.maximum(normals[:, 2:], SMALLEST_COSINE)
     mean = unit(blocks.average(slopes, mask))
@@ -206,9 +207,7 @@ def _normals_of(
 
 
 def _heights_of_prior(prior: Floats, mask: Bools, camera_matrix: Floats | None) -> Float64Array:
-    """Return the heights (P,) of a prior in the unit of the equations,
-    NaN where it is not known.
-    """
+    """Return a prior as heights (P,) in the unit of the equations, NaN where unknown."""
     if prior.shape != mask.shape:
         expected = f"expected {mask.shape} as in the normal map"
         raise UsageError(f"the prior has shape {prior.shape}, {expected}")
@@ -226,9 +225,7 @@ def _heights_of_prior(prior: Floats, mask: Bools, camera_matrix: Floats | None) 
 
 
 def _refuse(wrong: Bools, mask: Bools, what: str) -> None:
-    """Raise InputError if any values (P,) of a prior over a mask (H, W) are wrong, with the reason
-    in the message.
-    """
+    """Raise InputError if any value (P,) of a prior over a mask (H, W) is wrong: `what`."""
     if wrong.any():
         row, column = np.argwhere(mask)[wrong.argmax()]
         problem = f"{np.count_nonzero(wrong)} of {wrong.size} values of the prior are {what}"
@@ -239,9 +236,7 @@ def _refuse(wrong: Bools, mask: Bools, what: str) -> None:
 
 
 def _check_prior(surface: _Surface) -> None:
-    """Raise InputError for a prior that is negated, in another unit than the normals, or has values
-    far from others.
-    """
+    """Raise InputError for a prior that is negated, in another unit, or has outliers."""
     step = max(1, round(min(surface.prior_detail, *surface.mask.shape) / 4))
     coarse = surface.of_blocks(Blocks.of_step(surface.mask, step), keep_edges=False)
     equations = BilateralEquations.from_normals(

@@ -1,6 +1,4 @@
-"""Level a surface: remove the slope of its main plane, or of a plane through points, from heights
-and normals.
-"""
+"""Level a surface: remove the slope of its main plane, or of a plane through points."""
 
 from __future__ import annotations
 
@@ -20,8 +18,9 @@ _AROUND = 2  # pixels around a given point whose median height is taken
 def plane_slopes(
     heights: Floats, points: Sequence[tuple[int, int]] = (), *, aspect: float = 1.0
 ) -> tuple[float, float]:
-    """Return the slopes (dz/dx, dz/dy) of a plane in a height map (H, W), NaN outside the object; y
-    is up.
+    """Return the slopes (dz/dx, dz/dy) of a plane in a height map (H, W), y up.
+
+    The map is NaN outside the object.
 
     Args:
         points: columns and rows of at least three points on the plane, or () for the dominant plane
@@ -63,8 +62,9 @@ def plane_slopes(
 def level_heights(
     heights: Floats, slopes: tuple[float, float], *, aspect: float = 1.0
 ) -> Float64Array:
-    """Return heights (H, W) minus a plane with these slopes that has the mean height 0 on the
-    object.
+    """Subtract a plane with these slopes from heights (H, W).
+
+    The plane has the mean height 0 on the object.
     """
     rows, columns = np.indices(heights.shape)
     plane = np.asarray(slopes[0] * columns - slopes[1] * aspect * rows, np.float64)

@@ -1,5 +1,4 @@
-"""Triangle meshes of height and depth maps, and meshes of fewer triangles, whose normal texture
-keeps the detail.
+"""Triangle meshes of height and depth maps, also decimated with a texture of the normals.
 
 Frame: x right, y up, z to the camera (docs/files-and-frames.md). For an orthographic camera,
 coordinates are in pixels and the origin is the centre of the image. For a pinhole camera, they are
@@ -81,12 +80,11 @@ def surface_mesh(
     normal_map: Floats | None = None,
     largest_step: float | None = None,
 ) -> SurfaceMesh:
-    """Return the mesh of a height or depth map, with a vertex for each pixel of the mask, row by
-    row.
+    """Return the mesh of a height or depth map, with a vertex for each pixel of the mask.
 
-    Four pixels of the mask in a square make two triangles, split along the diagonal whose ends
-    differ less in height. Three make one triangle. Raises UsageError if the largest step is
-    negative.
+    Vertices are in the order of the pixels, row by row. Four pixels of the mask in a square make
+    two triangles, split along the diagonal whose ends differ less in height. Three make one
+    triangle. Raises UsageError if the largest step is negative.
 
     Args:
         depth: (H, W), finite in the mask (H, W): heights, or positive depths with a camera matrix,
@@ -153,15 +151,12 @@ def vertex_normals(vertices: Floats, triangles: Integers) -> Float64Array:
 
 
 def texture_coordinates(points: Floats, shape: tuple[int, ...]) -> Float32Array:
-    """Return the texture coordinates (V, 2) of image points (V, 2), column and row; see
-    SurfaceMesh.uvs.
-    """
+    """Return the texture coordinates (V, 2) of image points (V, 2); see SurfaceMesh.uvs."""
     return ((points + 0.5) / (shape[1], shape[0])).astype(np.float32)
 
 
 def fill_outside(texture: NDArray[Any], known: Bools) -> NDArray[Any]:
-    """Return a texture (H, W) or (H, W, 3) in which unknown pixels have the value of the nearest
-    known (H, W) one.
+    """Fill the unknown pixels of a texture (H, W) or (H, W, 3) with their nearest known ones.
 
     Viewers interpolate between pixels and reduce textures, which would bring in the background at
     the border.
@@ -206,8 +201,7 @@ def decimated_mesh(
     normal_map: Floats,
     largest_step: float | None = None,
 ) -> SurfaceMesh:
-    """Return a mesh of about `n_triangles` triangles, with a texture of the normals of the normal
-    map.
+    """Return a mesh of about `n_triangles` triangles, with a texture of the normals.
 
     Edges are collapsed where this moves the surface least (Garland and Heckbert, Surface
     simplification using quadric error metrics, SIGGRAPH 1997). A mesh that has no more triangles is
@@ -291,11 +285,11 @@ def _mesh_of_blocks(
 def _tangents(
     vertices: Float64Array, normals: Float64Array, camera_matrix: Floats | None
 ) -> Float64Array:
-    """Return the unit tangents (V, 3): perpendicular to the normals, and along the surface in a row
-    of the image.
+    """Return the unit tangents (V, 3), which follow the rows of the image along the surface.
 
-    A row of the image shows the plane that contains the viewing rays of the row. This is how
-    viewers compute tangents themselves (MikkTSpace): the derivative of the position along u.
+    They are perpendicular to the normals. A row of the image shows the plane that contains the
+    viewing rays of the row. This is how viewers compute tangents themselves (MikkTSpace): the
+    derivative of the position along u.
     """
     along = np.array((1.0, 0.0, 0.0)) if camera_matrix is None else ray_basis(camera_matrix)[0]
     rays = np.array((0.0, 0.0, -1.0)) if camera_matrix is None else vertices
@@ -311,11 +305,11 @@ def _normal_texture(
     tangents: Float64Array,
     normal_map: Floats,
 ) -> Picture:
-    """Return the normal texture (H, W, 3) of a mesh. Pixels outside the mesh have the value of the
-    nearest inside.
+    """Return the normal texture (H, W, 3) of a mesh.
 
-    `points` (V, 2) are the columns and rows of the vertices in the image, `triangles` (T, 3) their
-    numbers, `normals` and `tangents` (V, 3) unit. The normal map (H, W, 3) is zero off the object.
+    Pixels outside the mesh have the value of the nearest inside. `points` (V, 2) are the columns
+    and rows of the vertices in the image, `triangles` (T, 3) their numbers, `normals` and
+    `tangents` (V, 3) unit. The normal map (H, W, 3) is zero off the object.
     """
     texture = np.full(normal_map.shape, (128, 128, 255), np.uint8)
     known = np.zeros(normal_map.shape[:2], np.bool_)
@@ -334,8 +328,9 @@ def _normal_texture(
 def _in_frame(
     measured: Float64Array, normals: Float64Array, tangents: Float64Array
 ) -> Float64Array:
-    """Return the unit coordinates (Q, 3) of normals in frames T, B = N x T, N; T need not be
-    perpendicular to N.
+    """Return the unit coordinates (Q, 3) of normals in the frames T, B = N x T, N.
+
+    T need not be perpendicular to N.
     """
     bitangents = np.cross(normals, tangents)
     axes = (tangents, bitangents, normals)
@@ -350,8 +345,9 @@ def _in_frame(
 def _covered_pixels(
     points: Float64Array, triangles: Integers, shape: tuple[int, ...]
 ) -> Iterator[tuple[Indices, Float64Array, Indices, Indices]]:
-    """Yield the pixels whose centres are in triangles: triangle (Q,), barycentric coordinates (Q,
-    3), row, column.
+    """Yield the pixels whose centres are in triangles.
+
+    These are the triangle (Q,), barycentric coordinates (Q, 3), row and column of each.
     """
     for start in range(0, len(triangles), 50_000):
         numbers = np.arange(start, min(start + 50_000, len(triangles)))
@@ -379,9 +375,7 @@ def _covered_pixels(
 
 
 def _barycentric_forms(corners: Float64Array) -> Float64Array:
-    """Return the forms (T, 3, 3) whose products with (column, row, 1) are the three barycentric
-    coordinates.
-    """
+    """Return forms (T, 3, 3) that map (column, row, 1) to the barycentric coordinates."""
     following, last = np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)
     edge = last - following
     normal = np.stack((-edge[..., 1], edge[..., 0]), axis=-1)
@@ -392,9 +386,7 @@ def _barycentric_forms(corners: Float64Array) -> Float64Array:
 
 
 def _ranges(first: Float64Array, last: Float64Array) -> tuple[Indices, Indices]:
-    """Return the whole numbers from each first to its last, and before them the number of the range
-    of each.
-    """
+    """Return the integers from each first to its last, and before them the index of their range."""
     lengths = np.maximum(last - first + 1, 0).astype(np.intp)
     which = np.repeat(np.arange(len(lengths)), lengths)
     within = np.arange(len(which)) - np.repeat(np.cumsum(lengths) - lengths, lengths)

@@ -105,8 +105,9 @@ def _render_scenes(
     observer: Observer,
     advance: Advance,
 ) -> None:
-    """Render the scenes missing from the set, in this process or on workers, and add them in the
-    order of the plan.
+    """Render the scenes missing from the set, and add them in the order of the plan.
+
+    This process or workers render them.
 
     Raises LostError if the workers of a scene were lost (after finishing all other scenes), and any
     error from a worker or the set.

@@ -1,5 +1,4 @@
-"""Light directions from folders of images of mirror balls: the camera, the highlights, and the
-balls together.
+"""Light directions from folders of images of mirror balls.
 
 The light direction follows from the highlight of a lamp in a mirror ball. The ball's normal n at
 the highlight halves the angle between the light direction l and the direction v to the camera, so l
@@ -75,8 +74,7 @@ def unit_rays(points: Float64Array, matrix: Float64Array) -> Float64Array:
 
 
 def find_view(image: ImageHeader, matrix: Path | None) -> View:
-    """Return the camera that a file of its matrix, or an image's EXIF tags, describe; else a
-    distant one.
+    """Return the camera that a matrix file or an image's EXIF tags describe, else a distant one.
 
     Raises InputError if the file or the image cannot be read, or the file has no camera matrix.
     """
@@ -185,8 +183,9 @@ def ball_centre(outline: Float64Array, matrix: Float64Array) -> Float64Array:
 def reflect(
     centre: Float64Array, highlights: Float64Array, matrix: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball; NaN outside
-    the ball.
+    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball.
+
+    They are NaN outside the ball.
     """
     rays = unit_rays(highlights, matrix)
     across = centre - (rays @ centre)[:, None] * rays
@@ -245,11 +244,10 @@ class CalibratedLights:
 
 
 def find_ball_files(folder: Path, mask: Path | None = None) -> BallFiles:
-    """Return the files of the ball in a folder, with images in natural order or in the order of
-    filenames.txt.
+    """Return the files of the ball in a folder.
 
-    A mask that is given replaces the one in the folder. Raises InputError if the folder has no
-    images.
+    The images are in natural order or in the order of filenames.txt. A mask that is given replaces
+    the one in the folder. Raises InputError if the folder has no images.
     """
     not_lights, leave_out = (
         capture_files.NOT_PHOTOGRAPHS | set(REFERENCES),
@@ -274,8 +272,9 @@ def calibrate_ball(
     camera_matrix: Path | None = None,
     progress: Progress = ignore,
 ) -> BallCalibration:
-    """Find the outline, the highlights and the light directions of one ball. Only one image is in
-    memory at a time.
+    """Find the outline, the highlights and the light directions of one ball.
+
+    Only one image is in memory at a time.
 
     Args:
         circle: the outline. None takes it from the mask, from the reference image, or from the mean
@@ -321,8 +320,9 @@ def calibrate_ball(
 
 
 def combine_balls(balls: Sequence[BallCalibration]) -> CalibratedLights:
-    """Return the mean direction of each light over the balls. Raises InputError for unequal numbers
-    of images.
+    """Return the mean direction of each light over the balls.
+
+    Raises InputError for unequal numbers of images.
     """
     if len({len(ball.directions) for ball in balls}) > 1:
         counts = ", ".join(f"{len(ball.directions)} images ({ball.files.folder})" for ball in balls)

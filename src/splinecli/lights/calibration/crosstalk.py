@@ -1,5 +1,6 @@
-"""Crosstalk of three coloured lamps that light a matte gray ball at once: how much of each lamp a
-channel shows.
+"""Crosstalk of three coloured lamps that light a matte gray ball at once.
+
+It is the share of each lamp in each channel.
 """
 
 from __future__ import annotations
@@ -24,11 +25,10 @@ def measure_crosstalk(
     *,
     radiometry: RadiometricCalibration = AS_STORED,
 ) -> Float64Array:
-    """Return crosstalk matrices (N, 3, 3), with a mean diagonal of 1, from N colour images of a
-    matte gray ball.
+    """Return crosstalk matrices (N, 3, 3) from N colour images of a matte gray ball.
 
-    Least absolute deviations of I_c = sum over l of M[c, l] max(n . l_l, 0), over the pixels that
-    are not saturated.
+    Their mean diagonal is 1. Least absolute deviations of I_c = sum over l of M[c, l] max(n . l_l,
+    0), over the pixels that are not saturated.
 
     Args:
         files: colour images of the ball under all three lamps, and its mask.

@@ -1,5 +1,4 @@
-"""Intensities of lamps from a gray target, positions of near ones from several balls, and the
-report of a calibration.
+"""Intensities of lamps, positions of near lamps, and the report of a calibration.
 
 Near lamps are located by triangulation from two or more mirror balls. Each ball gives a ray: from
 the highlight on its surface in the direction of the lamp. The balls' centres, which follow from the
@@ -97,8 +96,9 @@ def measure_light_intensities(
 def read_target(
     files: BallFiles, target: Target, radiometry: RadiometricCalibration
 ) -> tuple[Float64Array, Indices, Iterator[StoredPixels]]:
-    """Return the normals (P, 3) of a target, the numbers of some of its pixels, and an iterator
-    over these pixels in each image.
+    """Return the normals (P, 3) of a target, and an iterator over its images.
+
+    Of each image, it yields the pixels whose numbers are returned, too.
     """
     mask, normals = _target_normals(files, common_size(files.facts)[0][:2], target)
     check_exposures(files.facts)
@@ -143,8 +143,9 @@ _PIXEL_ERROR = 0.3
 
 @dataclass(frozen=True, eq=False)
 class LampPositions:
-    """The positions of F lamps; x right, y up, z to the camera, from the middle of the image on the
-    balls' plane.
+    """The positions of F lamps; x right, y up, z to the camera.
+
+    The origin is the middle of the image on the balls' plane.
     """
 
     positions: Float64Array  # (F, 3)
@@ -165,11 +166,11 @@ class LampPositions:
 def triangulate_lamps(
     balls: Sequence[BallCalibration], *, ball_diameter: float | None = None
 ) -> LampPositions | None:
-    """Return the positions of the lamps from balls photographed by one camera; None for balls at
-    one place.
+    """Return the positions of the lamps from balls photographed by one camera.
 
-    The uncertainty comes from repeating the computation with other pixels, heights of the balls and
-    cameras (View.draw). It is larger if the rays miss each other by more than this explains.
+    Return None for balls at one place. The uncertainty comes from repeating the computation with
+    other pixels, heights of the balls and cameras (View.draw). It is larger if the rays miss each
+    other by more than this explains.
 
     Args:
         balls: at least two balls, or one at two places.
@@ -199,10 +200,10 @@ def _positions(
     diameter: float | None,
     errors: np.random.Generator | None = None,
 ) -> tuple[Float64Array, float, float]:
-    """Return positions (F, 3), pixel size and the mean square angle by which the rays miss each
-    other.
+    """Return the positions (F, 3), the pixel size and the mean square angle between the rays.
 
-    `errors` draws errors of the pixels; None takes them as they are.
+    It is the angle by which the rays miss each other. `errors` draws errors of the pixels; None
+    takes them as they are.
     """
 
     def error(*shape: int) -> Float64Array:
@@ -240,8 +241,7 @@ def _positions(
 
 
 def intersect_rays(starts: Float64Array, directions: Float64Array) -> tuple[Float64Array, float]:
-    """Return the points (F, 3) nearest to B rays each, and the mean square angle by which the rays
-    miss them.
+    """Return the points (F, 3) nearest to B rays each, and the mean square angle of the misses.
 
     The rays are (B, F, 3), B at least 2, with unit directions that have equal random errors. A NaN
     gives NaN.
@@ -324,8 +324,9 @@ def calibration_report(
 
 
 def calibration_lines(report: dict[str, Any]) -> list[str]:
-    """Return the lines of a report for people: the outlines, and how well balls and compared lights
-    agree.
+    """Return the lines of a report for people.
+
+    They state the outlines, and how well the balls and the compared lights agree.
     """
     lines = []
     for ball in report["balls"]:
