@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Protocol
 
-# a function that is called with the number of pixels that were just finished
+# A function that is called with the number of pixels that were just finished
 Progress = Callable[[int], object]
 
 
