@@ -40,7 +40,7 @@ from splinecli.surface.integration import integrate_normals
 from splinecli.system.machine import return_freed_memory
 from splinecli.system.progress import Clock, Progress, ignore
 
-# larger captures are fitted at about this size: fine detail hardly moves the surface
+# Larger captures are fitted at about this size: fine detail hardly moves the surface
 PIXELS_ON_THE_WAY = 40_000
 
 

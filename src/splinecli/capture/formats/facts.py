@@ -58,7 +58,7 @@ ORIENTATION, _EXIF = 0x0112, 0x8769
 _EXPOSURE = (0x829A, 0x829D, 0x8827)  # EXIF tags of exposure time, f-number and ISO sensitivity
 # Also those of the focal length; see balls.py
 _KEPT = (*_EXPOSURE, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA402, 0xA403, 0xA405)
-# Most chunks of a PNG before its pixels, or segments of a JPEG before its frame; usually a few dozen
+# Most chunks of a PNG before its pixels, or segments of a JPEG before its frame: usually dozens
 _MOST_PARTS = 10_000
 
 
