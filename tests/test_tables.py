@@ -90,7 +90,7 @@ def test_a_warning_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
         in make_tables.warnings_table()
     )
 
-    def check(seen: checks.CaptureSample) -> list[CaptureWarning]:
+    def check(seen: checks.Evidence) -> list[CaptureWarning]:
         return (
             [CaptureWarning(uniform, "All values are equal.")]
             if np.ptp(seen.observations) == 0

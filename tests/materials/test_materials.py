@@ -205,11 +205,7 @@ def test_channels_of_the_pictures():
     }
     middle = SIZE // 2, SIZE // 2
     # occlusion, roughness, metal
-    assert pictures["metallic_roughness.png"][middle][::-1].tolist() == [
-        255,
-        51,
-        204,
-    ]
+    assert pictures["metallic_roughness.png"][middle][::-1].tolist() == [255, 51, 204]
     assert pictures["base_colour.png"][middle][::-1].tolist() == [255, 188, 0]  # sRGB of 0.5 is 188
     assert pictures["specular.png"][middle] == 255  # 8 bits end at 1
     assert files["specular.npy"][middle] == 3

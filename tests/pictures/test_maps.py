@@ -255,11 +255,7 @@ def test_nothing_is_cut_at_the_edges_and_the_bar_runs_over_the_whole_scale() -> 
 
 SIZE = 8
 # viridis' ends; 0.85 of 255
-CELL_YELLOW, CELL_VIOLET, GRAY = (
-    (253, 231, 36),
-    (68, 1, 84),
-    (217, 217, 217),
-)
+CELL_YELLOW, CELL_VIOLET, GRAY = ((253, 231, 36), (68, 1, 84), (217, 217, 217))
 
 
 @cache
@@ -279,7 +275,7 @@ def draw_cells(
     png = observation_map_figure(
         sparse,
         np.zeros_like(sparse) if with_dense else None,
-        np.full_like(sparse, np.nan) if with_truth else None,
+        {"true map, all lights": np.full_like(sparse, np.nan)} if with_truth else {},
         pixels=np.array([[12, 34]] * n_pixels) if named else None,
         error_deg=np.full(n_pixels, 3.25),
         title="$cat$, 10 lights" if named else "",

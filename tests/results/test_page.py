@@ -30,7 +30,7 @@ from splinecli.maths.transfer import decode_transfer, encode_srgb
 from splinecli.pictures.maps import albedo_picture
 from splinecli.records.output_files import NORMALS
 from splinecli.results import pages as page_module
-from splinecli.results.pages import Entry, Row, index_page, result_page
+from splinecli.results.pages import IndexEntry, IndexRow, index_page, result_page
 
 HOSTILE = (
     '</script><script>document.title = "x"</script>'
@@ -380,7 +380,7 @@ def test_the_index_shows_small_pictures(open_page: OpenPage, tmp_path):
     }
     failed = {"capture": "x" * 200, "error": "y" * 200}
     html = index_page(
-        [Entry.of(part) for part in (report, {**report, "capture": "cut"}, failed)], tmp_path
+        [IndexEntry.of(part) for part in (report, {**report, "capture": "cut"}, failed)], tmp_path
     )
     (tmp_path / "a & b/normals.png").unlink()
     page = open_page(html, width=400)
@@ -415,7 +415,7 @@ def test_the_report_fits_a_narrow_screen(open_page: OpenPage):
 def test_pictures_of_earlier_results_that_are_none_of_ours_are_not_shown(tmp_path: Path) -> None:
     folder = tmp_path / "other"
     folder.mkdir()
-    entry = Entry(Row("other"), (NORMALS["png"],))
+    entry = IndexEntry(IndexRow("other"), (NORMALS["png"],))
     picture = folder / NORMALS["png"]
     cv2.imwrite(str(picture), np.full((9, 9, 3), 200, np.uint8))
     assert "data:image/jpeg" in index_page([entry], tmp_path)

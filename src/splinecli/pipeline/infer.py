@@ -60,8 +60,8 @@ from splinecli.results.material import (
     material_warnings,
 )
 from splinecli.results.pages import result_page
-from splinecli.surface.make import make_surface
-from splinecli.surface.mesh import check_triangles
+from splinecli.surface.make import SurfaceSettings, make_surface
+from splinecli.surface.mesh import Textures, check_triangles
 from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
 from splinecli.system.files import expanded, file_sha256
 from splinecli.system.progress import SILENT, Clock, Observer
@@ -74,10 +74,7 @@ if TYPE_CHECKING:
 # for Python, PyTorch and a batch of pixels; captures and their refinement need more
 BASE_BYTES = 500 * 2**20
 # most pixels refined at once (a tile with its margin); bytes per pixel
-REFINED_PIXELS, REFINED_BYTES = (
-    736**2,
-    1100,
-)
+REFINED_PIXELS, REFINED_BYTES = (736**2, 1100)
 
 
 def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
@@ -452,12 +449,9 @@ def _make_files(
             estimate.normal_map,
             capture.mask,
             camera_matrix,
-            colours,
-            gloss,
-            specular,
-            discontinuity=options.discontinuity,
-            pixel_size_mm=pixel_size,
-            progress=advance,
+            Textures(colours, gloss, specular),
+            SurfaceSettings(options.discontinuity, pixel_size),
+            advance,
         )
         formats = (*DEFAULT_FORMATS, *(("exr",) if "exr" in options.formats else ()))
         found.append(encode_surface(surface, formats))

@@ -17,7 +17,7 @@ from splinecli.pictures.plots import sky_plot
 from splinecli.pipeline.expected_seconds import expected_seconds
 from splinecli.pipeline.incoming import unpacked
 from splinecli.pipeline.infer import BASE_BYTES, infer_bytes
-from splinecli.pipeline.infer_options import InfoOptions, Reading
+from splinecli.pipeline.infer_options import InfoOptions, ReadingOptions
 from splinecli.recipe.steps import begin, follow, images_to_read
 from splinecli.recipe.work import Work
 from splinecli.system.files import check_free, write_bytes
@@ -33,7 +33,7 @@ ORIGINS = {
 
 
 def describe_capture(
-    options: InfoOptions, reading: Reading | None = None, observer: Observer = SILENT
+    options: InfoOptions, reading: ReadingOptions | None = None, observer: Observer = SILENT
 ) -> dict[str, Any]:
     """Read a capture without estimating normals, write the plot and the corrected lights, and
     return the report.
@@ -42,7 +42,7 @@ def describe_capture(
     warnings. Raises InputError, OutputError, or UsageError if the plot would be in the folder of
     the images, or options contradict.
     """
-    reading, plot, mended_lights = reading or Reading(), options.plot, options.mended_lights
+    reading, plot, mended_lights = reading or ReadingOptions(), options.plot, options.mended_lights
     for name, given in (
         ("--check-lights", options.check_lights),
         ("--mended-lights", mended_lights is not None),

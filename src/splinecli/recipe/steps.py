@@ -25,12 +25,7 @@ from splinecli.images.saturation import find_object, restore_saturated
 from splinecli.judge.checks import check_capture
 from splinecli.lights.light_fit import refine_capture
 from splinecli.maths import Float64Array
-from splinecli.recipe.reading import (
-    Observed,
-    compared_pixels,
-    exposure_warnings,
-    read_observations,
-)
+from splinecli.recipe.reading import Observed, compared_pixels, exposure_warnings, read_observations
 from splinecli.recipe.registration import register
 from splinecli.recipe.work import USUAL, RecipeOptions, Work
 from splinecli.records.capture_warnings import (
@@ -289,9 +284,7 @@ def images_to_read(work: Work) -> int:
 
 
 def begin(
-    source: Source,
-    light_indices: Sequence[int] | None = None,
-    options: RecipeOptions = USUAL,
+    source: Source, light_indices: Sequence[int] | None = None, options: RecipeOptions = USUAL
 ) -> Work:
     """Return the work on the images of these lights (None for all), before the first step.
 

@@ -96,11 +96,7 @@ def test_jpeg_channels_and_exif_orientation(write_image: WriteImage) -> None:
     exif = b"Exif\0\0II*\0" + struct.pack("<IHHHII", 8, 1, 0x112, 3, 1, 6) + b"\0" * 4
     path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:])
     # the segment works: by default OpenCV turns the image
-    assert cv2.imread(str(path)).shape == (
-        32,
-        16,
-        3,
-    )
+    assert cv2.imread(str(path)).shape == (32, 16, 3)
     image = read_image(path)
     assert image.shape == (16, 32, 3)
     apart = np.r_[:14, 18:32]  # the chroma is subsampled, so the colours mix where they meet

@@ -113,11 +113,7 @@ class RunLog:
         if maps is None:
             return
         figure = observation_map_figure(
-            maps.sparse,
-            maps.dense,
-            maps.truth,
-            error_deg=maps.error_deg,
-            truth_label="true map, gaps filled",
+            maps.sparse, maps.dense, {"true map, gaps filled": maps.truth}, error_deg=maps.error_deg
         )
         write_bytes(self.folder / TRAINING_MAPS, figure)
 
