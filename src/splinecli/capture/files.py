@@ -33,11 +33,11 @@ from splinecli.system.files import (
 
 _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
 _JPEG = (".jpg", ".jpeg")
-# treated as images only in a folder without others
+# Treated as images only in a folder without others
 _RARE = (".pgm", ".ppm", ".webp", ".avif", ".heic", ".heif")
 PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)  # suffixes of pictures, such as masks
 _KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # kinds of files of one photograph, best first
-# suffixes of images of an object
+# Suffixes of images of an object
 IMAGE_SUFFIXES = tuple(suffix for suffixes in _KINDS for suffix in suffixes)
 
 FILENAMES = "filenames.txt"

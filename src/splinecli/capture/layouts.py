@@ -137,7 +137,7 @@ def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...
     return tuple(there[name] for name in wanted)
 
 
-# in the layout of PSBox (Y. Xiong), whose images are in the folder Objects
+# The light file of PSBox (Y. Xiong), whose images are in the folder Objects
 _PSBOX_LIGHTS = ("light_directions.txt",)
 # Words in the names of pictures that other programs leave beside the photographs.
 _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all", "depth"})

@@ -213,7 +213,7 @@ def refuse_angles(table: NumberRows) -> None:
             " expected 3 columns (x y z)"
         )
     elif lengths == {3} and not numbered:
-        # perhaps with the same radius; vectors around an object have y < 0
+        # Perhaps all have the same radius. Vectors around an object have y < 0.
         azimuth, elevation, radius = np.array(rows).T
         in_range = (np.abs(azimuth) <= 360).all() and ((elevation > 0) & (elevation <= 90)).all()
         if np.ptp(radius) == 0 and in_range and elevation.max() > 2 and np.abs(azimuth).max() > 90:

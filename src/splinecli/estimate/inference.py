@@ -40,7 +40,7 @@ from splinecli.surface.integration import integrate_normals
 from splinecli.system.machine import return_freed_memory
 from splinecli.system.progress import Clock, Progress, ignore
 
-# larger captures are fitted at about this size: fine detail hardly moves the surface
+# Larger captures are fitted at about this size: fine detail hardly moves the surface
 PIXELS_ON_THE_WAY = 40_000
 
 
@@ -176,7 +176,7 @@ def _estimate(
     return normals, errors, judged
 
 
-# the most numbers, observations and directions, that an estimator gets at once
+# The most numbers, observations and directions, that an estimator gets at once
 _TILE_VALUES = 1 << 24
 
 
@@ -287,6 +287,6 @@ def _check_unit(normals: Float32Array, method: str) -> None:
     # A zero normal would have an error of 0 degrees, and NaN would be left out of the mean.
     for part in slices(len(normals), TILE_PIXELS):
         length = np.linalg.norm(normals[part], axis=1)
-        # accepts float16 and bfloat16, rejects zero vectors and NaN
+        # Accepts float16 and bfloat16, and rejects zero vectors and NaN.
         if not (np.abs(length - 1) <= 1e-2).all():
             raise SplinecliError(f"method {method} gave normals that are not unit vectors")

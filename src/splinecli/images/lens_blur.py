@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from splinecli.maths import Bools, Float32Array, Float64Array
 from splinecli.maths.pixel_grid import bounds
 
-# pixels around the object that the filter mixes with it, and half of the filter's side minus one
+# Half of the filter's side minus one: the number of pixels around the object that it mixes in
 REACH = 6
 WIDEST_SIGMA = 1.2  # the widest blur among the captures to which the estimate was fitted
 # Mean power of the noise over the images' mean power. Chosen on rendered captures with noise, 8
@@ -119,7 +119,7 @@ def _widest_at(correlation: float) -> float:
     each other. The captures to which the polynomial was fitted do not have such fine texture.
     """
     sigmas = np.linspace(0.05, 2, 200)
-    # of the values, at one and two pixels
+    # Correlations of the values at a distance of one and of two pixels
     one, two = np.exp(-1 / (4 * sigmas**2)), np.exp(-1 / sigmas**2)
     of_gradients = (2 * one - 1 - two) / (2 - 2 * one)
     return float(np.interp(correlation + 0.1, of_gradients, sigmas))

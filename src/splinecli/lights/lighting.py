@@ -98,7 +98,7 @@ class PixelLighting:
 PixelIndices = Integers  # numbers of some of a capture's pixels, in the order of its mask
 # From rows of a capture's pixels to their observations and light directions.
 LightingAt = Callable[[PixelIndices], PixelLighting]
-# pixels whose light is requested at once: under near lamps, each has its own lights
+# Pixels whose light is requested at once, because under near lamps each has its own lights
 LIT_AT_ONCE = 1 << 14
 
 

@@ -14,7 +14,7 @@ from splinecli.maths import Bools, Float32Array
 from splinecli.maths.pixel_grid import on_map, slices
 from splinecli.system.machine import one_thread_each, side_by_side
 
-# in larger captures, the net is applied to every second, third, ... row and column
+# In larger captures, the net is applied to every second, third, ... row and column
 _MOST_PIXELS = 60_000
 _BATCH = 1024
 _UNKNOWN_ERROR = 10.0  # of the roughness of a black pixel

@@ -5,10 +5,9 @@ The radiance of a pixel is
     base * ((1 - metallic) * diffuse + metallic * facets) + level * (1 - metallic) * facets
 
 in the unit of the observations, where `diffuse` and `facets` are lobes of the principled BRDF
-(Burley, "Physically Based Shading at Disney", SIGGRAPH 2012). With
-the roughness fixed, radiance is linear in the other parameters, except for Fresnel's increase at
-grazing angles. The camera looks along the z axis and lights are above the horizon, so this is at
-most 0.2 % of full reflection.
+(Burley, "Physically Based Shading at Disney", SIGGRAPH 2012). With the roughness fixed, radiance is
+linear in the other parameters, except for Fresnel's increase at grazing angles. The camera looks
+along the z axis and lights are above the horizon, so this is at most 0.2 % of full reflection.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ import torch
 from torch import Tensor
 
 LEAST_Z = 0.05  # of a normal; the BRDF has no value for a surface that faces away from the camera
-# reflectance at normal incidence of a dielectric whose `specular` is 1 (Burley 2012)
+# Reflectance at normal incidence of a dielectric whose `specular` is 1 (Burley 2012)
 F0_OF_SPECULAR = 0.08
 GGX = 2.0  # the exponent of the facets' distribution; smaller ones have longer tails
 
@@ -102,8 +101,8 @@ def facets(
     alpha_squared = (roughness**4).clamp(min=1e-4)
     spread = n_dot_h_squared * (alpha_squared - 1) + 1
     if bool((tail_exponent < 2).any()):
-        # pi times the factor that normalises the facets 1 / (1 + (a^2 - 1) (n.h)^2)^gamma; a^2 at
-        # gamma = 2
+        # Pi times the factor that normalises the facets 1 / (1 + (a^2 - 1) (n.h)^2)^gamma, which is
+        # a^2 for gamma = 2
         narrow = alpha_squared.clamp(max=0.999)
         norm = (tail_exponent - 1) * (1 - narrow) / (narrow ** (1 - tail_exponent) - 1)
         lobe = norm * power(spread, -tail_exponent)

@@ -36,20 +36,20 @@ from splinecli.surface.integration import integrate_normals
 _LIT = 0.05  # n.l from which a light is used; the rounded rim of a shadow is below
 _BRIGHT_QUANTILE = 0.95
 _SMOOTH = 4.0  # pixels: standard deviation of the mean over which the trust is decided
-# mean reflectance of dielectrics at normal incidence, which determines the exposure
+# Mean reflectance of dielectrics at normal incidence, which determines the exposure
 _DIELECTRIC = 0.04
 _WHITE_QUANTILE = 0.99  # of the bases, which are at most 1
 _MOST_EXPOSURE = 10.0  # times the exposure that makes the brightest bases white
 _SURE = 0.1  # the error of a roughness that the confidence refers to
 _LAPLACE = 1.41  # standard deviation of a Laplace distribution, in mean absolute errors
-# of the bright pixels' albedo and the mean observation: errors of all observations
+# Errors of all observations, as shares of the bright pixels' albedo and of the mean observation
 _FLOOR, _FLAT = 0.005, 0.12
 _WHITE = 0.999  # quantile of the observations
 _GRAY = 1e-3  # of the tint, below which all channels are equal
 _NORMAL_ERROR = 0.04  # radians, without a confidence
 _LEAST_ERROR, _MOST_ERROR = 0.015, 0.25  # radians
 _CONFIDENT = np.radians(5)  # the error that the confidence of a normal refers to
-# shadows of larger maps are computed for every second, third, ... row and column
+# Shadows of larger maps are computed for every second, third, ... row and column
 _MOST_CELLS = 40_000
 
 

@@ -55,7 +55,7 @@ def import_extra(
 
 
 LARGEST_IMAGE = 400_000_000  # pixels of the largest image that is read
-# lines "0::/group" (version 2) or "N:controllers:/group" (version 1)
+# Lines "0::/group" (version 2) or "N:controllers:/group" (version 1)
 _GROUPS = Path("/proc/self/cgroup")
 _MOUNT = Path("/sys/fs/cgroup")
 _GROUP_FILES = (  # the limit, the use, and the file cache within it

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Protocol
 
-# a function that is called with the amount of work that was just done: a number of pixels, or a
+# A function that is called with the amount of work that was just done: a number of pixels, or a
 # share of the whole
 Progress = Callable[[Any], object]
 

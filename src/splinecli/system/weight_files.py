@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from splinecli.errors import ModelError
 from splinecli.system.files import file_sha256, is_special, parse_json, utf8_name
 
-# largest tensor file to read, in bytes; a checkpoint of the paper's networks has 170 MB
+# Largest tensor file to read, in bytes. A checkpoint of the paper's networks has 170 MB
 LONGEST = 500_000_000
 LENGTH_BYTES = 8  # size of the header length at the start of a safetensors file
 Module = TypeVar("Module", bound=nn.Module)

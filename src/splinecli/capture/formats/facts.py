@@ -49,16 +49,16 @@ _BRANDS = {
 """The first bytes of the files, or the bytes from the ninth on, after a length and RIFF or ftyp."""
 
 PILLOW_KINDS = ("BMP", "TGA", "WEBP", "AVIF", "HEIF")  # kinds of files that Pillow reads, of 8 bits
-# width, height and the largest value
+# The groups are width, height and the largest value
 _PNM = re.compile(rb"P[56]" + 3 * rb"(?:\s|#[^\n]*\n)+?(\d{1,9})" + rb"\s")
-# shape (H, W, C) of an image as stored, and the bytes of each number
+# The shape (H, W, C) of an image as stored, and the bytes of each number
 StoredSize = tuple[tuple[int, ...], int]
 
 ORIENTATION, _EXIF = 0x0112, 0x8769
 _EXPOSURE = (0x829A, 0x829D, 0x8827)  # EXIF tags of exposure time, f-number and ISO sensitivity
-# also of the focal length; see balls.py
+# Also those of the focal length; see balls.py
 _KEPT = (*_EXPOSURE, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA402, 0xA403, 0xA405)
-# chunks of a PNG before its pixels, or segments of a JPEG before its frame; usually a few dozen
+# Most chunks of a PNG before its pixels, or segments of a JPEG before its frame: usually dozens
 _MOST_PARTS = 10_000
 
 
@@ -153,7 +153,7 @@ def facts_in(file: BinaryIO, kind: str, path: Path) -> ImageHeader:
     """Return the facts of an open image file. Raises InputError for a damaged TIFF."""
     if kind == "RAW":
         exif = _exif_tags(lambda tags: tags.load_from_fp(file))
-        # of developed RAW files; see decode_raw
+        # The white level is that of developed RAW files; see decode_raw.
         return ImageHeader(path, kind, white_level=65_535, exif=exif)
     if kind in PILLOW_KINDS:
         with open_with_pillow(file, kind, path) as picture:

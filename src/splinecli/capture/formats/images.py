@@ -226,7 +226,7 @@ def _decode_with_opencv(data: bytes, page: int) -> Array:
         return pixels
     if pixels.dtype in (np.uint8, np.uint16, np.float32):
         code = cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
-        # in place, and far faster than an index
+        # In place, and far faster than an index
         return cv2.cvtColor(pixels, code, dst=pixels)
     return pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]]
 

@@ -142,7 +142,7 @@ def _read_vectors(path: Path, expected: images.ExpectedSize | None) -> _Stored:
 
 def _read_text(path: Path, height: int, width: int) -> Float64Array:
     """Return vectors (H, W, 3), one on each line. Raises InputError."""
-    # characters of a number, with the separator after it
+    # At most 32 characters for each number, with the separator after it
     most = 3 * height * width * 32 + MOST_TEXT
     check_text_length(path, most, "a normal map")
     try:

@@ -31,7 +31,7 @@ _NUMBER_WITH_COMMA = re.compile(r"(?=\D*\d)[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
 
 _FROM_PIPES: dict[Path, bytes] = {}
 
-# one-based line of a row in its file, this line without comments, and its words
+# The one-based line of a row in its file, this line without comments, and its words
 WordRow = tuple[int, str, list[str]]
 
 MOST_TEXT = 1_000_000
@@ -39,7 +39,7 @@ MOST_TEXT = 1_000_000
 lights.
 """
 
-# hint for a line with decimal commas
+# Hint for a line with decimal commas
 DECIMAL_POINT = "A comma separates columns; write decimals with a point"
 
 

@@ -127,7 +127,7 @@ class BatchedEstimator(_InBatches):
 
 _CANDIDATES = 4096  # pixels from which the context of a capture is chosen
 _FEWEST_COVERED = 64  # with fewer fully covered candidates, all are used
-# smallest brightness of a fully covered outline pixel, relative to the mean of its inner neighbours
+# Smallest brightness of a fully covered outline pixel, relative to the mean of its inner neighbours
 _COVERED = 0.85
 
 

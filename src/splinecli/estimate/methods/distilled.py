@@ -131,7 +131,7 @@ def _rank_in_group(groups: Tensor) -> Tensor:
 BATCH = 256
 _LEARNING_RATE = 1e-2
 _WARM_UP = 0.1  # share of the steps in which the learning rate rises
-# decay of the means of the gradient and of its square in Adam (arXiv 1412.6980)
+# Decay of the means of the gradient and of its square in Adam (arXiv 1412.6980)
 _MOMENTUM, _SQUARES = 0.9, 0.99
 _ERROR_SHARE = 0.05  # of the loss of the errors in the loss
 _ROUNDED = 0.02  # radians; the loss is the angle, but quadratic below this one
@@ -249,7 +249,7 @@ class Perceptron(nn.Module):
         self.mean.copy_(inputs.mean(dim=0))
         self.spread.copy_(inputs.std(dim=0) + 1e-3)
         values = parameters_to_vector(parameters)
-        # parts of the vector, which each step changes as a whole
+        # Parts of the vector, which each step changes as a whole
         vector_to_parameters(values, parameters)
         mean, square = torch.zeros_like(values), torch.zeros_like(values)
         order = torch.empty(0, dtype=torch.long)
@@ -365,7 +365,7 @@ class DistilledEstimator(Estimator):
         Estimator.
         """
         normals, errors = (np.empty((len(observations), columns), np.float32) for columns in (3, 2))
-        # the pixels that are rare, or unlike the sample
+        # The pixels that are rare, or unlike the sample
         unlike = np.empty(len(observations), np.bool_)
 
         def apply(rows: slice) -> slice:

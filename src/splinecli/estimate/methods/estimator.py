@@ -62,7 +62,7 @@ def directions_at(light_directions: Directions, pixels: slice | Array) -> Direct
     return light_directions if light_directions.ndim == 2 else light_directions[pixels]
 
 
-# pixels that an estimator gets at once, unless it has a `tile_pixels` of its own
+# Pixels that an estimator gets at once, unless it has a `tile_pixels` of its own
 TILE_PIXELS = 16_384
 
 

@@ -132,7 +132,7 @@ class MapEncoder(nn.Module):
                 _SIDE**2, -1, self.patches.in_channels
             )
             x = linear(patches, self.patches.weight.flatten(1), self.patches.bias) + position
-            # of each residual block
+            # The two convolutions of each residual block
             for first, second in zip(layers[::2], layers[1::2], strict=True):
                 x = winograd_conv(winograd_conv(x.relu(), *first).relu_(), *second).add_(x)
             found[part] = x.transpose(0, 1)
@@ -213,7 +213,7 @@ class CaptureHead(nn.Module):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
         with torch.no_grad():
-            # initial value of the logarithm of the median error in radians
+            # The initial logarithm of the median error in radians
             self.linear.bias[1] = -3.5
 
     def forward(self, errors: Tensor, pixels: Tensor, capture: Tensor) -> Tensor:

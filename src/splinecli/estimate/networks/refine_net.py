@@ -88,7 +88,7 @@ def with_refined(features: Tensor, normals: Tensor, error: Tensor) -> Tensor:
 
 
 WIDTHS = (32, 64, 96, 64)  # channels at full, half, quarter and eighth resolution
-# widths in pixels of smoothed normals, which the net weights against the estimated normal
+# Widths in pixels of smoothed normals, which the net weights against the estimated normal
 SIGMAS = (0.7, 1.5, 3.0)
 # Side of a pixel at the coarsest scale. Tile origins are multiples of COARSEST.
 COARSEST = 2 ** (len(WIDTHS) - 1)

@@ -24,7 +24,7 @@ from splinecli.maths.normals import unit
 from splinecli.maths.pixel_grid import on_map
 from splinecli.system.machine import side_by_side
 
-# weight of a pixel that is dark under every light, relative to lit ones of the capture's brightness
+# Weight of a pixel that is dark under every light, relative to lit ones of the capture's brightness
 _DARK = 1e-6
 
 
