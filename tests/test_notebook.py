@@ -48,7 +48,7 @@ def matte(dtype: type = np.float64, scale: float = 1.0) -> tuple[NDArray[Any], N
 
 
 @pytest.mark.parametrize("intensities_known", [True, False])
-def test_the_same_to_the_last_bit_as_infer(intensities_known: bool, tmp_path: Path) -> None:
+def test_the_same_to_the_last_bit_as_infer(intensities_known, tmp_path):
     """With unknown intensities, both estimate them from the images."""
     images, directions, intensities, mask = read_medallion()
     folder = tmp_path / "medallion"
@@ -71,7 +71,7 @@ def test_the_same_to_the_last_bit_as_infer(intensities_known: bool, tmp_path: Pa
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_the_same_warnings_as_infer(tmp_path: Path) -> None:
+def test_the_same_warnings_as_infer(tmp_path):
     """Three lights of a small part: the network was not trained with so few."""
     images, directions, intensities, mask = read_medallion()
     small = np.zeros_like(mask)
@@ -107,7 +107,7 @@ def test_the_same_warnings_as_infer(tmp_path: Path) -> None:
     ("dtype", "scale"),
     [(np.float32, 3.0), (np.float64, 1e-3), (np.uint16, 50_000), (np.uint8, 200)],
 )
-def test_matte_images_of_each_type(dtype: type, scale: float) -> None:
+def test_matte_images_of_each_type(dtype, scale):
     images, normals = matte(dtype, scale)
     estimate = splinecli.estimate_normals(
         images, 5 * LIGHTS, method="ls", light_intensities=np.ones(len(LIGHTS))
@@ -120,14 +120,14 @@ def test_matte_images_of_each_type(dtype: type, scale: float) -> None:
 
 # clipped ones, as stored
 @pytest.mark.filterwarnings("ignore:The images fit the lights much better if")
-def test_saturated_values_are_restored_unless_as_stored() -> None:
+def test_saturated_values_are_restored_unless_as_stored():
     lights = np.concatenate((LIGHTS, LIGHTS[1:] * (-1, -1, 1)))
     _, normals = matte()
     images = np.moveaxis(normals @ lights.T, -1, 0)
     clipped = np.minimum(65_535 * images / 0.85, 65_535).astype(np.uint16)
     assert 0.1 < (clipped == 65_535).mean() < 0.5
 
-    def worst(images: NDArray[Any], **options: Any) -> float:
+    def worst(images, **options):
         known = np.ones(len(lights))
         estimate = splinecli.estimate_normals(
             images, lights, light_intensities=known, method="ls", **options
@@ -173,7 +173,7 @@ def test_saturated_values_are_restored_unless_as_stored() -> None:
         ({"light_intensities": np.zeros(4)}, InputError, "not a finite number above 0"),
     ],
 )
-def test_wrong_arguments(change: dict[str, Any], error: type[Exception], message: str) -> None:
+def test_wrong_arguments(change, error, message):
     arguments: dict[str, Any] = {
         "images": np.ones((4, 5, 6)),
         "light_directions": LIGHTS,
@@ -184,13 +184,13 @@ def test_wrong_arguments(change: dict[str, Any], error: type[Exception], message
     assert message in str(caught.value)
 
 
-def test_importing_the_package_loads_neither_torch_nor_numpy() -> None:
+def test_importing_the_package_loads_neither_torch_nor_numpy():
     code = "import sys, splinecli; print({'numpy', 'torch', 'cv2'}.intersection(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert done.stdout == "set()\n"
 
 
-def test_the_capture_has_a_mask_of_its_own() -> None:
+def test_the_capture_has_a_mask_of_its_own():
     images, normals = matte()
     mask = np.ones(normals.shape[:2], np.bool_)
     estimate = splinecli.estimate_normals(images, LIGHTS, mask, method="ls")

@@ -62,7 +62,7 @@ def errors_deg(folder: Path, out: Path, lights: Floats, **options: Any) -> Float
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_a_colour_image_gives_the_normals_of_a_gray_sphere(count: int, tmp_path: Path) -> None:
+def test_a_colour_image_gives_the_normals_of_a_gray_sphere(count, tmp_path):
     folder = write(tmp_path / "gray", count)
     assert errors_deg(folder, tmp_path / "out", LIGHTS[: 3 * count]).max() < 0.2
     report = json.loads((tmp_path / "out/gray/report.json").read_text())
@@ -71,7 +71,7 @@ def test_a_colour_image_gives_the_normals_of_a_gray_sphere(count: int, tmp_path:
     ]
 
 
-def test_messages_count_the_lights_of_channels(tmp_path: Path) -> None:
+def test_messages_count_the_lights_of_channels(tmp_path):
     folder = write(tmp_path / "gray", 1)
     reading = Reading(lights_in_channels=True)
     report = describe_capture(InfoOptions(capture=folder), reading)
@@ -86,24 +86,24 @@ def test_messages_count_the_lights_of_channels(tmp_path: Path) -> None:
         reading.open(folder)
 
 
-def test_the_networks_take_two_images(tmp_path: Path) -> None:
+def test_the_networks_take_two_images(tmp_path):
     folder = write(tmp_path / "gray", 2)
     assert errors_deg(folder, tmp_path / "out", LIGHTS, method="spline-net").mean() < 4
 
 
-def test_paint_is_taken_for_shading(tmp_path: Path) -> None:
+def test_paint_is_taken_for_shading(tmp_path):
     folder = write(tmp_path / "red", 1, paint=np.array((1.0, 0.4, 0.4)))
     assert errors_deg(folder, tmp_path / "out", LIGHTS[:3]).mean() > 5
 
 
-def test_the_intensities_of_the_lamps_are_divided_out(tmp_path: Path) -> None:
+def test_the_intensities_of_the_lamps_are_divided_out(tmp_path):
     folder, uneven = tmp_path / "gray", np.diag((1.0, 1.5, 0.6))
     write_capture(folder, photograph(LIGHTS, uneven), LIGHTS, mask=MASK)
     np.savetxt(folder / "light_intensities.txt", np.tile(np.diag(uneven), (2, 1)))
     assert errors_deg(folder, tmp_path / "out", LIGHTS).max() < 0.2
 
 
-def test_crosstalk_is_measured_on_a_gray_ball(tmp_path: Path) -> None:
+def test_crosstalk_is_measured_on_a_gray_ball(tmp_path):
     write_capture(tmp_path / "ball", photograph(LIGHTS), None, mask=MASK)
     found = measure_crosstalk(find_ball_files(tmp_path / "ball"), LIGHTS)
     expected = CROSSTALK / np.trace(CROSSTALK) * 3
@@ -112,7 +112,7 @@ def test_crosstalk_is_measured_on_a_gray_ball(tmp_path: Path) -> None:
         measure_crosstalk(find_ball_files(tmp_path / "ball"), LIGHTS[:3])
 
 
-def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+def test_what_does_not_fit_is_refused(tmp_path):
     write(tmp_path / "gray", 1)
     (tmp_path / "matrix.txt").write_text("1 1 1\n1 1 1\n1 1 1.1\n")
     with pytest.raises(InputError, match="do not separate the lamps"):

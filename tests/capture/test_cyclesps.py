@@ -73,7 +73,7 @@ def message(call: Callable[[], object]) -> str:
     return str(caught.value)
 
 
-def test_every_value_is_what_was_written(tmp_path: Path) -> None:
+def test_every_value_is_what_was_written(tmp_path):
     written = write_object(tmp_path / "Bunny", "specular", "metallic")["metallic"]
     capture = read_capture(tmp_path / "Bunny/images_metallic")
     assert capture.name == "Bunny_metallic"
@@ -91,9 +91,7 @@ def test_every_value_is_what_was_written(tmp_path: Path) -> None:
     assert not capture.ground_truth[~mask].any()
 
 
-def test_an_object_with_one_kind_is_that_capture(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_object_with_one_kind_is_that_capture(tmp_path, monkeypatch):
     write_object(tmp_path / "Bunny", "diffuse")
     by_object, by_folder = (
         read_capture(tmp_path / "Bunny"),
@@ -106,7 +104,7 @@ def test_an_object_with_one_kind_is_that_capture(
         assert capture_name(way) == open_capture(way).files.name == "Bunny_diffuse"
 
 
-def test_find_captures(tree: Path) -> None:
+def test_find_captures(tree):
     objects = [tree / "PRPS/Bunny9", tree / "PRPS/Bunny10"]
     of_prps = [folder / f"images_{kind}" for folder in objects for kind in ("metallic", "specular")]
     of_diffuse = [tree / f"PRPS_Diffuse/{name}/images_diffuse" for name in ("Bunny9", "Bunny10")]
@@ -129,7 +127,7 @@ def test_find_captures(tree: Path) -> None:
     ]
 
 
-def test_missing_files_of_the_object(tmp_path: Path) -> None:
+def test_missing_files_of_the_object(tmp_path):
     folder = tmp_path / "Bunny"
     write_object(folder, "specular")
     (folder / "gt_normal.tif").unlink()
@@ -153,7 +151,7 @@ def test_missing_files_of_the_object(tmp_path: Path) -> None:
     assert read_capture(folder, mask=mask).n_pixels == 7
 
 
-def test_masks_that_do_not_fit(tmp_path: Path) -> None:
+def test_masks_that_do_not_fit(tmp_path):
     folder = tmp_path / "Bunny"
     write_object(folder, "specular")
     cv2.imwrite(str(folder / "onboundary.png"), np.zeros((HEIGHT, WIDTH, 3), np.uint8))

@@ -111,7 +111,7 @@ def test_images_of_which_the_network_makes_little(run, medallion, monkeypatch):
     rng = np.random.default_rng(0)
     for path in medallion.glob("[01]*.png"):
         shape = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).shape
-        cv2.imwrite(str(path), (65_535 * rng.uniform(size=shape) ** 4).astype(np.uint16))
+        cv2.imwrite(str(path), (65_535 * rng.uniform(size=shape) ** 4).astype(np.uint16))  # type: ignore[attr-defined]
     mask = np.zeros(shape[:2], np.uint8)
     mask[60:68, 60:68] = 255
     cv2.imwrite(str(medallion / "mask.png"), mask)
@@ -148,7 +148,7 @@ LIGHTS = spiral_lights(10, 55, 12)
 def ball(*, background: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Images (F, H, W) from 0 to 1 of a ball before a plane of this brightness, and its mask."""
     normals, mask = sphere(80)
-    normals, mask = (
+    normals, mask = (  # type: ignore[assignment]
         np.pad(array, ((16, 16), (16, 16), *((0, 0),) * (array.ndim - 2)))
         for array in (normals, mask)
     )

@@ -19,7 +19,7 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 @pytest.mark.parametrize("convention", ["opengl", "directx"])
-def test_maps_of_infer(capture: Path, run: Any, convention: str) -> None:
+def test_maps_of_infer(capture, run, convention):
     pytest.importorskip("OpenEXR")
     options = ("--method", "ls", "--maps", "albedo", "--surface", "--convention", convention)
     assert run("infer", capture, *options, "--format", "exr,png,npy,tiff").code == 0

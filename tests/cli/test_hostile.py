@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from splinecli.cli import main
-from splinecli.cli.signals import GRACE_SECONDS, report_interruption
+from splinecli.cli.signals import GRACE_SECONDS, TOLD, report_interruption
 
 posix = pytest.mark.skipif(os.name == "nt", reason="POSIX files, signals and limits")
 
@@ -322,7 +322,7 @@ __main__.run()
 
 @posix
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_a_library_that_swallows_interrupts_while_it_is_imported(tmp_path: Path, name: str) -> None:
+def test_a_library_that_swallows_interrupts_while_it_is_imported(tmp_path, name):
     (tmp_path / "library.py").write_text(LIBRARY.format(signal=name))
     done = subprocess.run(
         [sys.executable, "-c", IMPORTING], cwd=tmp_path, capture_output=True, text=True, timeout=60
@@ -334,7 +334,7 @@ def test_a_library_that_swallows_interrupts_while_it_is_imported(tmp_path: Path,
     )
 
 
-def test_libraries_print_nothing(tmp_path: Path) -> None:
+def test_libraries_print_nothing(tmp_path):
     command = """
 import logging, sys, warnings
 from splinecli import __main__
@@ -355,10 +355,10 @@ __main__.run()
 def test_an_interruption_is_told_once(capfd, monkeypatch):
     """The thread that ends the process after a SIGTERM may come when the command has told of it."""
     monkeypatch.setattr(
-        main.typer.main, "get_command", lambda _: type("Stub", (), {"main": lambda *_, **__: 130})
+        "typer.main.get_command", lambda _: type("Stub", (), {"main": lambda *_, **__: 130})
     )
     try:
         assert main.main([]) == report_interruption() == 130
     finally:
-        main.TOLD.clear()
+        TOLD.clear()
     assert capfd.readouterr().err == "splinecli: interrupted.\n"

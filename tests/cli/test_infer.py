@@ -237,7 +237,7 @@ def test_interrupted_while_estimating(capture, run, monkeypatch):
 def test_closed_streams_and_ascii_terminals(capture, make_capture):
     make_capture("naïve ☃")
 
-    def call(name: str, redirection: str) -> int:
+    def call(name, redirection):
         command = (
             f'"{sys.executable}" -m splinecli infer "{name}" --method ls --overwrite {redirection}'
         )

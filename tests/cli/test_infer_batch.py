@@ -202,7 +202,7 @@ def test_the_pipeline_reports_to_an_observer(capture, make_capture):
     (capture / "mask.png").unlink()
 
     class Recorder(Observer):
-        def __init__(self) -> None:
+        def __init__(self):
             self.bars: dict[str, list[tuple[float, str]]] = {}
 
         @contextmanager
@@ -313,7 +313,7 @@ def test_a_failure_is_that_of_its_capture(place, make_capture, run, monkeypatch)
     names = [str(make_capture(name)) for name in (*FAILURES, "good")]
     errors, original = iter([error for error, _ in FAILURES.values()]), getattr(*place)
 
-    def fail(*arguments: object, **options: object) -> object:
+    def fail(*arguments, **options):
         if (error := next(errors, None)) is not None:
             raise error
         return original(*arguments, **options)

@@ -250,8 +250,8 @@ def test_a_folder_of_results_gives_the_surface_of_infer(run, capture, view):
     np.testing.assert_allclose(*depths, rtol=1e-5, atol=1e-5)
     for name in ("mesh.ply", "mesh.glb"):
         one, other = (trimesh.load(place / name, force="mesh", process=False) for place in places)
-        np.testing.assert_allclose(one.vertices, other.vertices, rtol=1e-5, atol=1e-5)
-        np.testing.assert_array_equal(one.faces, other.faces)
+        np.testing.assert_allclose(one.vertices, other.vertices, rtol=1e-5, atol=1e-5)  # type: ignore[attr-defined]
+        np.testing.assert_array_equal(one.faces, other.faces)  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("size", [["--pixel-size", "2e-9"], ["--object-width", "64e-9"]])
@@ -418,6 +418,6 @@ def test_refusals(refuse):
         (3, ["normals.npy", "--camera-matrix", "mirrored.txt"]),
         (5, ["normals.npy", "-o", "done"]),
     )
-    cases = [(code, words if "-o" in words else [*words, "-o", "out"]) for code, words in cases]
-    refuse("integrate", cases, "integrate_refusals.txt")
+    placed = [(code, words if "-o" in words else [*words, "-o", "out"]) for code, words in cases]
+    refuse("integrate", placed, "integrate_refusals.txt")
     assert not Path("out").exists()

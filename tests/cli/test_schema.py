@@ -64,7 +64,7 @@ def test_results_of_evaluate(make_capture, run, lights):
 
 
 def test_the_published_schema_is_that_of_the_documents():
-    """Made by `python man/make_pages.py`."""
+    """Made by `python docs/generate.py`."""
     assert json_schema() == SCHEMA
 
 

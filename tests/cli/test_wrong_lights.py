@@ -64,7 +64,7 @@ def test_an_order_is_named_although_the_intensities_are_unequal_and_unknown(
             "The light intensities were estimated", ""
         )
     write_lights(medallion, lambda lights: lights[[0, 5, 2, 3, 4, 1, 6, 7, 8, 9]])
-    for command in (("info", medallion), ("infer", medallion, "--method", "ls", "--overwrite")):
+    for command in (("info", medallion), ("infer", medallion, "--method", "ls", "--overwrite")):  # type: ignore[assignment]
         found = run(*command, *options).err
         assert "much better with the lights of 02.png and 06.png exchanged (misfit" in found
 
@@ -201,7 +201,7 @@ def rough() -> np.ndarray:
     return rough / np.linalg.norm(rough, axis=1, keepdims=True)
 
 
-def test_infer(document, rough: np.ndarray) -> None:
+def test_infer(document, rough):
     command = ("infer", "bump", "--method", "ls", "--overwrite")
     given, refined = (document(*command, *more) for more in ((), ("--refine-lights",)))
     np.testing.assert_allclose(given["light_directions"], rough, atol=1e-5)
@@ -214,7 +214,7 @@ def test_infer(document, rough: np.ndarray) -> None:
     assert refined["angular_error_deg"]["mean"] < 0.9 * given["angular_error_deg"]["mean"]
 
 
-def test_evaluate(document, rough: np.ndarray) -> None:
+def test_evaluate(document, rough):
     """Both protocols share a folder: trials with refined lights are other trials."""
     command = ("evaluate", "bump", "--method", "ls", "--n-lights", "all", "-o", "scores")
     options = ((), ("--refine-lights",), ("--refine-lights", "--light-error-deg", "3"))
@@ -225,7 +225,7 @@ def test_evaluate(document, rough: np.ndarray) -> None:
     assert errors[2] not in errors[:2]
 
 
-def test_evaluate_skips_a_capture_with_near_lamps(run, rough: np.ndarray) -> None:
+def test_evaluate_skips_a_capture_with_near_lamps(run, rough):
     write_bump(Path("near"))
     np.savetxt("near/light_positions.txt", BUMP_LAMPS)
     Path("near/pixel_size.txt").write_text("2\n")
@@ -238,7 +238,7 @@ def test_evaluate_skips_a_capture_with_near_lamps(run, rough: np.ndarray) -> Non
     assert run("evaluate", "near", *arguments).code == 2
 
 
-def test_a_light_error_without_refined_lights_is_refused(run, rough: np.ndarray) -> None:
+def test_a_light_error_without_refined_lights_is_refused(run, rough):
     result = run("evaluate", "bump", "--method", "ls", "--light-error-deg", "4")
     assert (result.code, "--light-error-deg needs --refine-lights" in result.err) == (2, True)
 

@@ -26,7 +26,7 @@ def capture(ground_truth: NDArray[np.float64] | None = None) -> Capture:
     return Capture("bowl", 0.7 * normals[mask] @ LIGHTS.T, LIGHTS, (0, 1, 2, 3), mask, ground_truth)
 
 
-def test_normals_stand_where_their_pixels_are() -> None:
+def test_normals_stand_where_their_pixels_are():
     normals, mask = bowl()
     estimate = estimate_normals(capture(), LeastSquares())
     assert estimate.normal_map.dtype == np.float32
@@ -38,7 +38,7 @@ def test_normals_stand_where_their_pixels_are() -> None:
 
 
 @pytest.mark.parametrize("tile_pixels", [1, 7, 10_000])
-def test_tiles_change_nothing_but_the_progress(tile_pixels: int) -> None:
+def test_tiles_change_nothing_but_the_progress(tile_pixels):
     whole = estimate_normals(capture(), LeastSquares())
     done: list[int] = []
     estimator = LeastSquares()
@@ -55,9 +55,7 @@ def test_tiles_change_nothing_but_the_progress(tile_pixels: int) -> None:
 @pytest.mark.parametrize(
     ("near", "n_lights", "most"), [(False, 10, 1 << 19), (True, 10, 1 << 18), (True, 40, 1 << 16)]
 )
-def test_an_estimator_gets_fewer_pixels_at_once_if_each_has_many_numbers(
-    near, n_lights, most
-) -> None:
+def test_an_estimator_gets_fewer_pixels_at_once_if_each_has_many_numbers(near, n_lights, most):
     """Under near lamps, every pixel has its own directions, which would take gigabytes."""
     asked = []
 

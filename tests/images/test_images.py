@@ -60,12 +60,12 @@ def find(
 
 @pytest.mark.parametrize("level", [4095, 1023, 16_383, 4095 << 4, 15_600, 3839])
 @pytest.mark.parametrize("exposure", [1.1, 2.0, 4.0])
-def test_levels_below_full_scale_are_found(level: int, exposure: float) -> None:
+def test_levels_below_full_scale_are_found(level, exposure):
     images = clip(sphere()[0], level, exposure)
     assert find(images) == (WhiteLevel(level, "images"), np.count_nonzero(images == level))
 
 
-def test_the_file_s_full_scale_is_the_level_where_it_is_reached() -> None:
+def test_the_file_s_full_scale_is_the_level_where_it_is_reached():
     images = clip(sphere()[0], 65_535)
     assert find(images) == (FULL_SCALE, np.count_nonzero(images == 65_535))
     eight_bit = clip(sphere()[0], 255).astype(np.uint8)
@@ -131,11 +131,11 @@ def normalised_to_12_bits() -> NDArray[np.uint16]:
         pytest.param(np.full((12, SIDE, SIDE), 4095, np.uint16), id="constant"),
     ],
 )
-def test_what_is_not_clipped_is_not_saturated(images: Images) -> None:
+def test_what_is_not_clipped_is_not_saturated(images):
     assert find(images) == (FULL_SCALE, 0)
 
 
-def test_one_clipped_image_is_not_enough() -> None:
+def test_one_clipped_image_is_not_enough():
     images = bright(3000)
     images[0] = clip(sphere()[0], 4095)[0]
     assert find(images)[1] == 0
@@ -144,7 +144,7 @@ def test_one_clipped_image_is_not_enough() -> None:
 
 
 @pytest.mark.parametrize("stored", [4095, 4095 << 4, 65_535])
-def test_levels_that_the_files_state(stored: int) -> None:
+def test_levels_that_the_files_state(stored):
     """A stated number of bits, whether or not the program shifted or scaled them to 16."""
     images = bright(100)
     images[3, 0, 0] = stored
@@ -154,7 +154,7 @@ def test_levels_that_the_files_state(stored: int) -> None:
     assert find(bright(100), stated=4095) == (WhiteLevel(4095, "file"), 0)
 
 
-def test_a_given_level_is_used_as_it_is() -> None:
+def test_a_given_level_is_used_as_it_is():
     images = clip(sphere()[0], 4095)
     assert find(images, given=4000) == (WhiteLevel(4000, "given"), np.count_nonzero(images >= 4000))
     assert find(images / 4095, given=1) == (
@@ -174,7 +174,7 @@ def ls_error_deg(folder: Path, normals: NDArray[np.float64], **settings: float) 
     return float(angle_between_deg(unit(solution.T), normals.reshape(-1, 3)).mean())
 
 
-def test_12_bit_images_are_restored_like_16_bit_ones(tmp_path: Path) -> None:
+def test_12_bit_images_are_restored_like_16_bit_ones(tmp_path):
     images, normals = sphere()
     folder = write_capture(tmp_path / "vase", clip(images, 4095), LIGHTS)
     capture = open_capture(folder).read()
@@ -196,7 +196,7 @@ def test_12_bit_images_are_restored_like_16_bit_ones(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("bits", "level"), [((12,), 4095), ((16,), None), ((12, 12, 12), 4095), ((5, 6, 5), None)]
 )
-def test_png_states_its_bits(tmp_path: Path, bits: tuple[int, ...], level: int | None) -> None:
+def test_png_states_its_bits(tmp_path, bits, level):
     images = bright(100)
     images[0, 0, 0] = 4095  # one pixel alone would not tell
     if len(bits) == 3:
@@ -216,7 +216,7 @@ def test_png_states_its_bits(tmp_path: Path, bits: tuple[int, ...], level: int |
     ("tag", "value", "level"),
     [(281, 4095, 4095), (281, 4001, None), (50717, 3839, 3839), (50717, 65_535, None)],
 )
-def test_tiff_states_its_level(tmp_path: Path, tag: int, value: int, level: int | None) -> None:
+def test_tiff_states_its_level(tmp_path, tag, value, level):
     folder = tmp_path / "vase"
     folder.mkdir()
     for number, image in enumerate(bright(100)):
@@ -249,7 +249,7 @@ def write_12_bit_tiff(path: Path, image: NDArray[np.uint16]) -> None:
     path.write_bytes(header + data + table)
 
 
-def test_tiff_of_12_bits_a_sample(tmp_path: Path) -> None:
+def test_tiff_of_12_bits_a_sample(tmp_path):
     images = clip(sphere()[0], 4095)
     for number, image in enumerate(images):
         write_12_bit_tiff(tmp_path / f"{number}.tif", image)

@@ -137,7 +137,7 @@ def test_generated_pixels_that_training_did_not_use():
                 batch.observations, batch.light_directions, batch.valid, captures=batch.captures
             )
             gloss, _ = material_net(pixels, context.brightness)
-            true = batch.truth.material
+            true = batch.truth.material  # type: ignore[attr-defined]
             wrong = (gloss.roughness - true.roughness[:, 0]).abs()
             is_right = (gloss.metalness > 0.5) == (true.metallic[:, 0] > 0.5)
             rows.append(
@@ -211,8 +211,8 @@ def test_channels_of_the_pictures():
     ]
     assert pictures["base_colour.png"][middle][::-1].tolist() == [255, 188, 0]  # sRGB of 0.5 is 188
     assert pictures["specular.png"][middle] == 255  # 8 bits end at 1
-    assert files["specular.npy"][middle] == 3
-    assert not files["roughness.npy"][0, 0]
+    assert files["specular.npy"][middle] == 3  # type: ignore[index]
+    assert not files["roughness.npy"][0, 0]  # type: ignore[index]
     assert not material_facts(values, MASK).gray
 
 

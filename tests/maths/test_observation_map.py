@@ -3,7 +3,6 @@ there.
 """
 
 import math
-from typing import Any
 
 import pytest
 import torch
@@ -68,7 +67,7 @@ CELLS = {
 
 
 @pytest.mark.parametrize("grid", CELLS)
-def test_cell_of_a_known_direction(grid: Any) -> None:
+def test_cell_of_a_known_direction(grid):
     options = {} if grid == "ours" else {"grid": grid}
     for x, y, row, column in CELLS[grid]:
         direction = torch.tensor(
@@ -79,7 +78,7 @@ def test_cell_of_a_known_direction(grid: Any) -> None:
         assert occupied.flatten().nonzero().item() == row * 32 + column, (x, y)
 
 
-def test_the_disc_of_both_grids() -> None:
+def test_the_disc_of_both_grids():
     # By counting the odd a, b within 31 and 32 of the origin.
     assert unit_disc(32).sum() == 812
     assert torch.equal(unit_disc(32), cell_directions(32)[1])
@@ -91,7 +90,7 @@ def test_the_disc_of_both_grids() -> None:
 
 
 @pytest.mark.parametrize("size", [8, 31, 32, 64])
-def test_every_cell_centre_lies_in_its_own_cell(size: int) -> None:
+def test_every_cell_centre_lies_in_its_own_cell(size):
     directions, inside = cell_directions(size)
     expected = torch.arange(size * size).view(size, size)
     assert torch.equal(light_cells(directions, size)[inside], expected[inside])
@@ -99,7 +98,7 @@ def test_every_cell_centre_lies_in_its_own_cell(size: int) -> None:
     assert not directions[~inside].any()
 
 
-def test_lights_in_one_cell_are_averaged() -> None:
+def test_lights_in_one_cell_are_averaged():
     directions = torch.tensor(
         [[0.01, 0.01, 1.0], [0.02, 0.03, 1.0], [0.05, 0.01, 1.0], [0.5, 0.5, 0.7]]
     )
@@ -110,7 +109,7 @@ def test_lights_in_one_cell_are_averaged() -> None:
     assert maps.occupied[0, 0, 15, 16] == 1
 
 
-def test_lights_that_are_not_valid_leave_no_trace() -> None:
+def test_lights_that_are_not_valid_leave_no_trace():
     observations, directions = random_rig(1, 3, 12)
     valid = torch.arange(12) % 3 != 0
     with_flags = sparse_map(observations, directions, valid.expand(3, 12))
@@ -139,7 +138,7 @@ SYMMETRIES = {
 @pytest.mark.parametrize("name", SYMMETRIES)
 @quick
 @given(SEEDS)
-def test_maps_follow_the_lights(name: str, seed: int) -> None:
+def test_maps_follow_the_lights(name, seed):
     change, changed = SYMMETRIES[name]
     observations, directions = random_rig(seed, 3, 20)
     order = torch.randperm(20, generator=torch.Generator().manual_seed(seed))

@@ -21,7 +21,6 @@ from splinecli.capture import open_capture, read_capture
 from splinecli.capture.formats.facts import StatedCurve, read_header
 from splinecli.errors import UsageError
 from splinecli.maths.transfer import (
-    TransferCurve,
     decode_transfer,
     encode_srgb,
     parse_transfer,
@@ -97,7 +96,7 @@ SRGB_PARAMETERS = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
         (profile(curv(461), space=b"GRAY"), 1.8008),
     ],
 )
-def test_curves_with_a_name(icc: bytes, expected: TransferCurve) -> None:
+def test_curves_with_a_name(icc, expected):
     found = profile_curve(icc)
     assert found is not None and found[1] == expected
 
@@ -110,7 +109,7 @@ def test_curves_with_a_name(icc: bytes, expected: TransferCurve) -> None:
         (curv(0, 10_000, 65_535), lambda x: np.interp(x, (0, 0.5, 1), (0, 10_000 / 65_535, 1))),
     ],
 )
-def test_curves_without_a_name(curve: bytes, expected: Any) -> None:
+def test_curves_without_a_name(curve, expected):
     found = profile_curve(profile(curve))
     assert found is not None and isinstance(found[1], tuple)
     np.testing.assert_allclose(decode_transfer(STORED, found[1]), expected(STORED), atol=2e-4)
@@ -133,12 +132,12 @@ def test_curves_without_a_name(curve: bytes, expected: Any) -> None:
         bytes(36) + b"acsp" + bytes(88) + b"\xff" * 4,
     ],
 )
-def test_profiles_without_a_usable_curve(icc: bytes) -> None:
+def test_profiles_without_a_usable_curve(icc):
     assert profile_curve(icc) is None
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
-def test_profiles_in_files(tmp_path: Path, suffix: str) -> None:
+def test_profiles_in_files(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     by = 'colour profile "Made up"'
     assert read_header(write(path, profile(curv(563)))).curve == StatedCurve(2.1992, by)
@@ -151,7 +150,7 @@ def test_profiles_in_files(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
-def test_a_huge_profile_counts_as_none(tmp_path: Path, suffix: str) -> None:
+def test_a_huge_profile_counts_as_none(tmp_path, suffix):
     path = write(tmp_path / f"a{suffix}", bytes(12 << 20))  # in a PNG, 12 kB that expand
     tracemalloc.start()
     assert read_header(path).curve.unread
@@ -159,7 +158,7 @@ def test_a_huge_profile_counts_as_none(tmp_path: Path, suffix: str) -> None:
     tracemalloc.stop()
 
 
-def test_many_parts_in_a_jpeg(tmp_path: Path) -> None:
+def test_many_parts_in_a_jpeg(tmp_path):
     part = b"\xff\xe2" + struct.pack(">H", 65_535) + b"ICC_PROFILE\0\1\1"
     (tmp_path / "a.jpg").write_bytes(b"\xff\xd8" + (part + bytes(65_535 - 16)) * 100)
     assert read_header(tmp_path / "a.jpg").curve == StatedCurve(None, "JPEG", unread=True)
@@ -174,7 +173,7 @@ def capture(folder: Path, icc: bytes | None, pixels: NDArray[Any], suffix: str) 
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_a_capture_is_read_with_the_curve_of_its_profile(tmp_path: Path, suffix: str) -> None:
+def test_a_capture_is_read_with_the_curve_of_its_profile(tmp_path, suffix):
     adobe = capture(tmp_path / "adobe", profile(curv(563), name="Adobe RGB (1998)"), PIXELS, suffix)
     found = read_capture(adobe)
     linear = read_capture(
@@ -192,7 +191,7 @@ def test_a_capture_is_read_with_the_curve_of_its_profile(tmp_path: Path, suffix:
     )
 
 
-def test_profiles_that_differ_or_cannot_be_read(tmp_path: Path) -> None:
+def test_profiles_that_differ_or_cannot_be_read(tmp_path):
     folder = capture(tmp_path / "a", SRGB_PROFILE, PIXELS, ".png")
     write(folder / "2.png", profile(curv(563)))
     source = open_capture(folder)
@@ -205,7 +204,7 @@ def test_profiles_that_differ_or_cannot_be_read(tmp_path: Path) -> None:
     )
 
 
-def test_profiles_are_read_by_others_too(tmp_path: Path) -> None:
+def test_profiles_are_read_by_others_too(tmp_path):
     """The files written here are what other programs take them for."""
     for suffix in (".png", ".jpg", ".tif"):
         path = write(

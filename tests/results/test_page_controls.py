@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from browser import OpenPage
 from html_page import REPORT, SIDE, ball, light_at
 from splinecli.results import pages as page_module
 from splinecli.results.pages import result_page
@@ -25,7 +24,7 @@ def lights_are(page: Any, x: float, y: float, note: str) -> None:
 
 
 @pytest.mark.parametrize("webgl", [True, False])
-def test_mouse_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> None:
+def test_mouse_keys_and_a_narrow_screen(open_page, webgl):
     normals, mask = ball()
     report = {**REPORT, "capture": "x" * 300, "warnings": [{"code": "", "text": "y" * 300}]}
     values = {"albedo": normals + 1, "confidence": mask.astype(np.float32)}
@@ -45,7 +44,7 @@ def test_mouse_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> Non
     box = canvas.bounding_box()
     radius = box["width"] / 2
 
-    def at(x: float, y: float) -> tuple[float, float]:
+    def at(x, y):
         return box["x"] + radius * (1 + x), box["y"] + radius * (1 - y)
 
     page.mouse.move(*at(0, 0))
@@ -92,7 +91,7 @@ def test_mouse_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> Non
 TOUCH = "Input.dispatchTouchEvent"
 
 
-def test_fingers(open_page: OpenPage) -> None:
+def test_fingers(open_page):
     """One finger moves the light, two move and zoom the picture about what they touch."""
     page = open_page(result_page(REPORT, *ball()), width=400, height=800)
     page.evaluate("splinecli.ready")
@@ -101,7 +100,7 @@ def test_fingers(open_page: OpenPage) -> None:
     client = page.context.new_cdp_session(page)
     client.send("Emulation.setTouchEmulationEnabled", {"enabled": True, "maxTouchPoints": 2})
 
-    def touch(kind: str, *shares: tuple[float, float]) -> None:
+    def touch(kind, *shares):
         points = [
             {"x": box["x"] + x * box["width"], "y": box["y"] + y * box["height"], "id": number}
             for number, (x, y) in enumerate(shares)

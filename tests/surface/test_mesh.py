@@ -32,7 +32,7 @@ def face_normals(mesh: SurfaceMesh) -> NDArray[np.float64]:
     return np.cross(b - a, c - a)
 
 
-def test_four_pixels() -> None:
+def test_four_pixels():
     depth = np.array([[5.0, 0.0], [1.0, 4.0]])
     mesh = surface_mesh(depth, np.ones((2, 2), bool))
     np.testing.assert_array_equal(
@@ -47,7 +47,7 @@ def test_four_pixels() -> None:
 
 
 @pytest.mark.parametrize("mask", [np.ones((15, 20), bool), RAGGED], ids=["full", "ragged"])
-def test_triangles_tile_the_mask_and_face_the_camera(mask: NDArray[np.bool_]) -> None:
+def test_triangles_tile_the_mask_and_face_the_camera(mask):
     mesh = surface_mesh(WAVE, mask)
     assert len(mesh.vertices) == np.count_nonzero(mask)
     # Seen along z, half a pixel each, counter-clockwise.
@@ -59,7 +59,7 @@ def test_triangles_tile_the_mask_and_face_the_camera(mask: NDArray[np.bool_]) ->
     assert len({frozenset(triangle) for triangle in mesh.triangles.tolist()}) == len(mesh.triangles)
 
 
-def test_perspective_vertices_project_into_their_pixels() -> None:
+def test_perspective_vertices_project_into_their_pixels():
     depth, mask = 50 + WAVE, RAGGED
     mesh = surface_mesh(depth, mask, CAMERA)
     # OpenCV's frame: y down, z forward.
@@ -73,7 +73,7 @@ def test_perspective_vertices_project_into_their_pixels() -> None:
 
 
 @pytest.mark.parametrize("camera", [None, CAMERA])
-def test_steps_are_left_open(camera: NDArray[np.float64] | None) -> None:
+def test_steps_are_left_open(camera):
     height = np.repeat([0.0, 10.0], [4, 5])[None] + np.zeros((6, 1))
     # A step of 10 pixels at a focal length of sqrt(100 * 110).
     depth = height if camera is None else 7 * np.exp(-height / np.sqrt(11_000))
@@ -91,7 +91,7 @@ def test_steps_are_left_open(camera: NDArray[np.float64] | None) -> None:
         surface_mesh(depth, mask, largest_step=-1)
 
 
-def test_pixels_without_triangles() -> None:
+def test_pixels_without_triangles():
     for mask in (np.eye(4, dtype=bool), np.ones((1, 5), bool)):
         mesh = surface_mesh(np.zeros(mask.shape), mask)
         assert mesh.triangles.shape == (0, 3)
@@ -99,7 +99,7 @@ def test_pixels_without_triangles() -> None:
 
 
 @pytest.mark.parametrize("camera", [None, CAMERA])
-def test_attributes_of_vertices(camera: NDArray[np.float64] | None) -> None:
+def test_attributes_of_vertices(camera):
     colours, normal_map, mask = COLOURS, np.zeros((15, 20, 3)), RAGGED
     normal_map[..., 2] = 1
     normal_map[3, 4] = (0.6, 0, 0.8)
@@ -115,7 +115,7 @@ def test_attributes_of_vertices(camera: NDArray[np.float64] | None) -> None:
     }
 
 
-def test_normals_of_the_triangles() -> None:
+def test_normals_of_the_triangles():
     mesh = surface_mesh(0.5 * COLUMNS - 2.0 * ROWS, np.ones((15, 20), bool))
     slope = np.array((-0.5, -2, 1))
     np.testing.assert_allclose(
@@ -128,14 +128,14 @@ MASK = np.hypot(*np.mgrid[-20:20, -25:25]) < 18
 
 
 @pytest.mark.parametrize("share", [1.0, 0.01])
-def test_the_number_of_blocks_is_bounded_for_scattered_pixels(share: float) -> None:
+def test_the_number_of_blocks_is_bounded_for_scattered_pixels(share):
     mask = RNG.random((300, 400)) < share
     blocks = Blocks.over(mask, 100)
     assert 50 <= np.count_nonzero(blocks.mask) <= 200
 
 
 @pytest.mark.parametrize("step", [1, 3, 7])
-def test_samples_are_those_of_scipy(step: int) -> None:
+def test_samples_are_those_of_scipy(step):
     blocks = Blocks.of_step(MASK, step)
     values = RNG.random((np.count_nonzero(blocks.mask), 2)).astype(np.float32)
     found = blocks.sample(blocks.spread(values), *np.nonzero(MASK))
@@ -194,7 +194,7 @@ def decimated(camera: NDArray[np.float64] | None) -> SurfaceMesh:
     )
 
 
-def test_normals_relit_from_the_file(decimated: SurfaceMesh) -> None:
+def test_normals_relit_from_the_file(decimated):
     full = surface_mesh(*dome(None)[0])
     assert 0.04 < len(decimated.triangles) / len(full.triangles) <= 0.05
     ((_, content),) = encode_surface(Surface(np.zeros((1, 1)), decimated, "pixel", 1.0), ["glb"])
@@ -226,9 +226,7 @@ def test_normals_relit_from_the_file(decimated: SurfaceMesh) -> None:
     assert without.mean() > 10
 
 
-def test_tangents_are_those_that_viewers_compute(
-    decimated: SurfaceMesh, camera: NDArray[np.float64] | None
-) -> None:
+def test_tangents_are_those_that_viewers_compute(decimated, camera):
     """MikkTSpace: the mean of the derivatives of the position along u in the triangles around a
     vertex.
     """

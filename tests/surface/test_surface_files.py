@@ -2,7 +2,6 @@
 
 import io
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -40,7 +39,7 @@ def load(content: bytes, form: str) -> Any:
 
 
 @pytest.mark.parametrize("coloured", [False, True])
-def test_ply_and_stl(coloured: bool) -> None:
+def test_ply_and_stl(coloured):
     mesh = wave(coloured)
     stl = load(encode(mesh, "stl")["mesh.stl"], "stl")
     np.testing.assert_array_equal(stl.triangles, mesh.vertices[mesh.triangles])
@@ -61,7 +60,7 @@ def test_ply_and_stl(coloured: bool) -> None:
 
 
 @pytest.mark.parametrize("coloured", [False, True])
-def test_obj(coloured: bool, tmp_path: Path) -> None:
+def test_obj(coloured, tmp_path):
     mesh = wave(coloured)
     files = encode(mesh, "obj", unit="millimetre")
     assert sorted(files) == ["mesh.mtl", "mesh.obj", *(["mesh.png"] if coloured else [])]
@@ -82,7 +81,7 @@ def test_obj(coloured: bool, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("coloured", [False, True])
-def test_glb(coloured: bool) -> None:
+def test_glb(coloured):
     mesh = wave(coloured)
     content = encode(mesh, "glb", millimetres=2)["mesh.glb"]
     tree, arrays = read_glb(content)
@@ -102,7 +101,7 @@ def test_glb(coloured: bool) -> None:
         np.testing.assert_array_equal(arrays["colour"], COLOURS)
     else:
         assert matte["baseColorFactor"] == pytest.approx([GRAY / 255] * 3 + [1])
-    [read] = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()
+    [read] = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()  # type: ignore[attr-defined]
     assert len(read.faces) == len(mesh.triangles)
 
 
@@ -113,7 +112,7 @@ def glossy(specular: NDArray[np.floating]) -> SurfaceMesh:
     )
 
 
-def test_reflectance_of_glb() -> None:
+def test_reflectance_of_glb():
     """KHR_materials_specular has 0.04 times its colour as reflectance, and trimesh reads the rest
     as before.
     """
@@ -128,7 +127,7 @@ def test_reflectance_of_glb() -> None:
     np.testing.assert_allclose(0.04 * colour[3, :, 1], 0.08 * specular, rtol=0.02)
     np.testing.assert_array_equal(arrays["colour"], COLOURS)
     assert (arrays["gloss"] == (255, 102, 0)).all()
-    [read] = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()
+    [read] = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()  # type: ignore[attr-defined]
     np.testing.assert_array_equal(np.asarray(read.visual.material.baseColorTexture), COLOURS)
     for usual in (None, np.float32(0.5)):
         tree, _ = read_glb(
@@ -141,7 +140,7 @@ def test_reflectance_of_glb() -> None:
     }
 
 
-def test_gloss_of_obj(tmp_path: Path) -> None:
+def test_gloss_of_obj(tmp_path):
     files = encode(glossy(np.float32(0.5)), "obj")
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
@@ -163,7 +162,7 @@ def test_gloss_of_obj(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.asarray(read.visual.material.image), COLOURS)
 
 
-def test_a_mesh_without_triangles() -> None:
+def test_a_mesh_without_triangles():
     mesh = wave(mask=np.eye(*SHAPE, dtype=bool))
     assert b"element vertex 15\n" in encode(mesh, "ply")["mesh.ply"]
     assert encode(mesh, "obj")["mesh.obj"].count(b"\nv ") == 15

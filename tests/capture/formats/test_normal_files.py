@@ -51,9 +51,7 @@ def write(path: Path, normals: NDArray[np.float64]) -> Path:
 
 @pytest.mark.parametrize("name", ["a.mat", "a.npy", "a.txt", "a.tif"])
 @pytest.mark.parametrize("length", [1, 0.95, 40])
-def test_floating_point_sources(
-    tmp_path: Path, normals: NDArray[np.float64], name: str, length: float
-) -> None:
+def test_floating_point_sources(tmp_path, normals, name, length):
     read = read_normals(write(tmp_path / name, normals * length), MASK)
     assert read.dtype == np.float32
     np.testing.assert_allclose(read, normals, atol=2e-7)
@@ -92,7 +90,7 @@ def test_what_is_gray_or_not_finite_or_outside_the_mask_is_no_ground_truth(
     assert np.count_nonzero(read.any(axis=2)) == 12
 
 
-def test_mat_with_another_key(tmp_path: Path, normals: NDArray[np.float64]) -> None:
+def test_mat_with_another_key(tmp_path, normals):
     path = tmp_path / "a.mat"
     scipy.io.savemat(path, {"N": normals, "mask": MASK})
     np.testing.assert_allclose(read_normals(path, MASK), normals, atol=1e-6)
@@ -104,9 +102,7 @@ def test_mat_with_another_key(tmp_path: Path, normals: NDArray[np.float64]) -> N
             read_normals(path, MASK)
 
 
-def test_text_with_commas_and_with_a_wrong_word(
-    tmp_path: Path, normals: NDArray[np.float64]
-) -> None:
+def test_text_with_commas_and_with_a_wrong_word(tmp_path, normals):
     path = tmp_path / "a.txt"
     rows = ["{:.9f}, {:.9f}, {:.9f}".format(*row) for row in normals.reshape(-1, 3)]
     path.write_text("\n".join(rows))
@@ -116,9 +112,7 @@ def test_text_with_commas_and_with_a_wrong_word(
         read_normals(path, MASK)
 
 
-def test_damaged_and_unknown_files_and_other_sizes(
-    tmp_path: Path, normals: NDArray[np.float64]
-) -> None:
+def test_damaged_and_unknown_files_and_other_sizes(tmp_path, normals):
     sizes = dict.fromkeys(
         ("a.mat", "a.npy", "a.tif"), "found a ground truth of 5 x 3 pixels, expected 5 x 4 as in"
     )
@@ -143,9 +137,7 @@ def test_damaged_and_unknown_files_and_other_sizes(
         read_normals(tmp_path / "a.exr", MASK)
 
 
-def test_rows_in_the_wrong_order_are_turned_over(
-    tmp_path: Path, normals: NDArray[np.float64]
-) -> None:
+def test_rows_in_the_wrong_order_are_turned_over(tmp_path, normals):
     # As in the normal.txt of DiLiGenT's Harvest: the rows alone, the vectors are right.
     path = write(tmp_path / "normal.txt", normals[::-1])
     read, upside_down = read_ground_truth(path, MASK)
@@ -175,7 +167,7 @@ def test_a_photograph_is_no_normal_map_and_a_huge_value_overflows_nothing(
     )
 
 
-def test_matlab_s_small_whole_numbers_are_vectors(tmp_path: Path) -> None:
+def test_matlab_s_small_whole_numbers_are_vectors(tmp_path):
     """A double whose values are all whole lies as bytes; its class says that it is no picture."""
     plane = np.broadcast_to(np.array([0, 0, 1], np.uint8), (*SHAPE, 3))
     scipy.io.savemat(tmp_path / "a.mat", {"Normal_gt": plane})
@@ -188,9 +180,7 @@ def test_matlab_s_small_whole_numbers_are_vectors(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("dtype", ["f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"])
-def test_matlab_s_numbers_are_those_that_scipy_reads(
-    tmp_path: Path, dtype: str, compressed: bool
-) -> None:
+def test_matlab_s_numbers_are_those_that_scipy_reads(tmp_path, dtype, compressed):
     values = np.random.default_rng(0).integers(0, 100, (*SHAPE, 3)).astype(dtype)
     arrays = {
         "a": np.eye(2),
@@ -206,7 +196,7 @@ def test_matlab_s_numbers_are_those_that_scipy_reads(
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-def test_matlab_s_byte_orders_and_undefined_types(tmp_path: Path, compressed: bool) -> None:
+def test_matlab_s_byte_orders_and_undefined_types(tmp_path, compressed):
     """Of an undefined type, SciPy's reader ends the process."""
     values = np.arange(60.0).reshape(*SHAPE, 3)
     for order in "<>":

@@ -117,7 +117,7 @@ def ground_truth(path: Path) -> object:
     return read_ground_truth(path, np.ones(SMALL, np.bool_))
 
 
-def test_images_too_large_to_read(tmp_path: Path) -> None:
+def test_images_too_large_to_read(tmp_path):
     write_claim(tmp_path / "a.png", 21_000, 21_000)
     write_jpeg(tmp_path / "a.jpg")
     write_tiff(tmp_path / "a.tif", HUGE, HUGE, zlib.compress(bytes(1000)))
@@ -125,7 +125,7 @@ def test_images_too_large_to_read(tmp_path: Path) -> None:
         refused(lambda name=name: decode_image(tmp_path / name), TOO_LARGE + ".*a smaller copy")
 
 
-def test_images_of_another_size_than_others_are_not_decoded(tmp_path: Path) -> None:
+def test_images_of_another_size_than_others_are_not_decoded(tmp_path):
     ball, capture = tmp_path / "ball", tmp_path / "capture"
     for folder in (ball, capture):
         folder.mkdir()
@@ -150,9 +150,7 @@ def test_images_of_another_size_than_others_are_not_decoded(tmp_path: Path) -> N
         open_capture(capture).read()
 
 
-def test_a_capture_larger_than_the_memory_is_not_decoded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_capture_larger_than_the_memory_is_not_decoded(tmp_path, monkeypatch):
     """Six images of 361 megapixels: each would fit by itself."""
     np.savetxt(
         tmp_path / "lights.txt", [(0, 0, 1), (1, 0, 1), (0, 1, 1), (1, 1, 2), (0, 1, 2), (1, 0, 2)]
@@ -167,7 +165,7 @@ def test_a_capture_larger_than_the_memory_is_not_decoded(
 
 
 @pytest.mark.parametrize("size", [(754_974_744, 24), (2**31 - 1, 2**31 - 1)])
-def test_no_command_takes_memory_for_a_header(tmp_path: Path, size: tuple[int, int]) -> None:
+def test_no_command_takes_memory_for_a_header(tmp_path, size):
     lights = np.array([(0, 0, 1), (0.6, 0, 0.8), (0, 0.6, 0.8), (-0.6, 0, 0.8)])
     np.savetxt(tmp_path / "lights.txt", lights)
     for number in range(4):
@@ -188,7 +186,7 @@ def test_no_command_takes_memory_for_a_header(tmp_path: Path, size: tuple[int, i
     refused(lambda: describe_capture(InfoOptions(capture=tmp_path)), other)
 
 
-def test_content_that_expands_beyond_its_shape(tmp_path: Path) -> None:
+def test_content_that_expands_beyond_its_shape(tmp_path):
     write_tiff(tmp_path / "a.tif", *SMALL, zlib.compress(bytes(1 << 28), 1))
     refused(lambda: decode_image(tmp_path / "a.tif"), "the TIFF is damaged")
     write_mat(tmp_path / "a.mat", (*SMALL, 3), 1 << 28)
@@ -200,7 +198,7 @@ def test_content_that_expands_beyond_its_shape(tmp_path: Path) -> None:
     )
 
 
-def test_a_tiff_whose_tile_is_larger_than_its_picture(tmp_path: Path) -> None:
+def test_a_tiff_whose_tile_is_larger_than_its_picture(tmp_path):
     for name, side in (("small.tif", 128), ("a.tif", 21_000)):
         packer = zlib.compressobj(1)
         tile = b"".join(packer.compress(bytes(side)) for _ in range(side)) + packer.flush()
@@ -209,7 +207,7 @@ def test_a_tiff_whose_tile_is_larger_than_its_picture(tmp_path: Path) -> None:
     refused(lambda: decode_image(tmp_path / "a.tif"), "the TIFF is damaged")
 
 
-def test_headers_without_end(tmp_path: Path) -> None:
+def test_headers_without_end(tmp_path):
     """Each would take seconds to minutes to walk through. The steps that are read are counted in
     place of time.
     """
@@ -232,7 +230,7 @@ def test_headers_without_end(tmp_path: Path) -> None:
     refused(lambda: ground_truth(mat), "the MATLAB file is damaged")
 
 
-def test_arrays_too_large_to_read(tmp_path: Path) -> None:
+def test_arrays_too_large_to_read(tmp_path):
     with (tmp_path / "a.npy").open("wb") as file:
         header = {"descr": "<f8", "fortran_order": False, "shape": (HUGE, HUGE, 3)}
         np.lib.format.write_array_header_1_0(file, header)
@@ -249,7 +247,7 @@ def test_arrays_too_large_to_read(tmp_path: Path) -> None:
     refused(lambda: read_normal_map(tmp_path / "a.mat"), TOO_LARGE)
 
 
-def test_a_picture_with_gigabytes_behind_it(tmp_path: Path) -> None:
+def test_a_picture_with_gigabytes_behind_it(tmp_path):
     for name in ("a.png", "a.jpg", "a.tif"):
         cv2.imwrite(str(tmp_path / name), np.ones(SMALL, np.uint8))
         with (tmp_path / name).open("ab") as file:
@@ -260,7 +258,7 @@ def test_a_picture_with_gigabytes_behind_it(tmp_path: Path) -> None:
         )
 
 
-def test_light_files_with_too_much_text(tmp_path: Path) -> None:
+def test_light_files_with_too_much_text(tmp_path):
     for text, message in (
         ("0 0 1" + " " * 1_000_000, "found 1.0 MB, expected a text file of at most 1.0"),
         ("1\n" * 60_000, "found 60001 lines, expected at most 50000"),
@@ -270,7 +268,7 @@ def test_light_files_with_too_much_text(tmp_path: Path) -> None:
         refused(lambda: read_light_directions(tmp_path / "a.txt"), message)
 
 
-def test_an_image_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_larger_than_the_memory(monkeypatch):
     monkeypatch.setattr("splinecli.capture.formats.images.available_memory", lambda: 1e9)
     check_stored_size((10_000, 10_000), 1, Path("a.png"))
     with pytest.raises(InputError, match=r"takes 1\.5 GB of memory, but 1\.0 GB are available"):

@@ -29,7 +29,6 @@ from splinecli.maths.normals import angle_between_deg
 from splinecli.maths.robust import inverse_3x3, multiply_symmetric
 
 ROBUST = ("iw12", "l1", "ls-trimmed")
-Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
 def estimate(
@@ -41,14 +40,14 @@ def estimate(
 
 
 @pytest.mark.parametrize("name", ROBUST)
-def test_exact_on_matte_pixels(name: str, matte_pixels: Pixels) -> None:
+def test_exact_on_matte_pixels(name, matte_pixels):
     normals, lights, observations = matte_pixels
     # What is left is the rounding of the observations to float32, 6e-8 of each.
     assert angle_between_deg(estimate(name, observations, lights), normals).max() < 1e-3
 
 
 @pytest.mark.parametrize("name", ROBUST)
-def test_exact_in_spite_of_a_highlight_and_a_cast_shadow(name: str, matte_pixels: Pixels) -> None:
+def test_exact_in_spite_of_a_highlight_and_a_cast_shadow(name, matte_pixels):
     normals, lights, observations = matte_pixels
     spoilt = observations.copy()
     rows = np.arange(len(spoilt))
@@ -61,7 +60,7 @@ def test_exact_in_spite_of_a_highlight_and_a_cast_shadow(name: str, matte_pixels
     assert found.max() < 0.1
 
 
-def test_iw12_fixed_point(matte_pixels: Pixels) -> None:
+def test_iw12_fixed_point(matte_pixels):
     """The result solves eq. 11 for the variances that it gives rise to, written out with LAPACK."""
     _, lights, observations = matte_pixels
     rng = np.random.default_rng(2)
@@ -81,7 +80,7 @@ def test_iw12_fixed_point(matte_pixels: Pixels) -> None:
         np.testing.assert_allclose(b, solution, rtol=1e-5)
 
 
-def test_l1_is_the_linear_programme_s_optimum() -> None:
+def test_l1_is_the_linear_programme_s_optimum():
     rng = np.random.default_rng(0)
     lights = rng.normal(size=(10, 3)) * (0.4, 0.4, 0.1) + (0, 0, 1)
     lights /= np.linalg.norm(lights, axis=1, keepdims=True)
@@ -100,7 +99,7 @@ def test_l1_is_the_linear_programme_s_optimum() -> None:
 
 
 @pytest.mark.parametrize(("count", "dropped"), [(3, 0), (4, 0), (5, 0), (6, 1), (10, 2), (96, 19)])
-def test_trimmed_ends(count: int, dropped: int) -> None:
+def test_trimmed_ends(count, dropped):
     """Moving a trimmed observation further out changes nothing; moving the next one does."""
     rng = np.random.default_rng(0)
     lights = torch.tensor(rng.normal(size=(count, 3)))
@@ -115,7 +114,7 @@ def test_trimmed_ends(count: int, dropped: int) -> None:
     assert not torch.allclose(solve_trimmed(outer, lights), before)
 
 
-def test_lights_that_span_a_plane_or_a_line_give_finite_normals() -> None:
+def test_lights_that_span_a_plane_or_a_line_give_finite_normals():
     """Three directions, each many times: under IW12's weights one of them may drop out, then
     another.
     """
@@ -129,7 +128,7 @@ def test_lights_that_span_a_plane_or_a_line_give_finite_normals() -> None:
             np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
 
 
-def test_weighted_step_against_lapack() -> None:
+def test_weighted_step_against_lapack():
     rng = np.random.default_rng(0)
     lights, observations = rng.normal(size=(7, 3)), rng.uniform(size=(5, 7))
     weight = 10.0 ** rng.uniform(-6, 6, (5, 7))
@@ -165,7 +164,7 @@ def to_unit_scale(observations: Tensor) -> Tensor:
     return observations / observations.amax(dim=1, keepdim=True)
 
 
-def test_pixels_without_shadow_are_recovered_with_their_albedo() -> None:
+def test_pixels_without_shadow_are_recovered_with_their_albedo():
     truth, lights = normals_under(30, 500), ring(10, 40)
     observations = to_unit_scale(truth @ lights.T)
     assert observations.min() > 0.05  # no light is taken for a shadow
@@ -175,7 +174,7 @@ def test_pixels_without_shadow_are_recovered_with_their_albedo() -> None:
     torch.testing.assert_close(scaled.norm(dim=1), albedo, rtol=1e-3, atol=0)
 
 
-def test_shadows_over_a_third_of_the_lights_are_seen_through() -> None:
+def test_shadows_over_a_third_of_the_lights_are_seen_through():
     truth, lights = normals_under(25, 500), ring(12, 40)
     observations = truth @ lights.T
     # Four neighbours of the ring lie in cast shadow, elsewhere for every pixel.
@@ -187,7 +186,7 @@ def test_shadows_over_a_third_of_the_lights_are_seen_through() -> None:
     assert error_deg(fit_lambertian(observations, lights), truth).max() < 0.5
 
 
-def test_a_highlight_counts_less_than_in_least_squares() -> None:
+def test_a_highlight_counts_less_than_in_least_squares():
     truth, lights = normals_under(20, 200), ring(12, 40)
     observations = truth @ lights.T
     observations[:, 3] *= 2
@@ -217,7 +216,7 @@ def inverse(matrices: NDArray[Any], smallest: float, library: str) -> NDArray[An
 
 
 @pytest.mark.parametrize("library", ["numpy", "torch"])
-def test_inverse(library: str) -> None:
+def test_inverse(library):
     matrices = positive_matrices(1000)
     expected = np.linalg.inv(matrices)
     size = np.abs(expected).max(axis=(1, 2), keepdims=True)
@@ -225,7 +224,7 @@ def test_inverse(library: str) -> None:
     np.testing.assert_allclose(inverse(matrices, 1e-14, library) / size, expected / size, atol=1e-8)
 
 
-def test_numpy_and_torch_agree_to_the_last_bit() -> None:
+def test_numpy_and_torch_agree_to_the_last_bit():
     matrices = positive_matrices(1000)
     assert (
         inverse(matrices, 1e-12, "numpy").tobytes() == inverse(matrices, 1e-12, "torch").tobytes()
@@ -234,13 +233,13 @@ def test_numpy_and_torch_agree_to_the_last_bit() -> None:
 
 @pytest.mark.parametrize("rank", [0, 1, 2])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_inverse_of_a_singular_matrix_is_positive(rank: int, dtype: type) -> None:
+def test_inverse_of_a_singular_matrix_is_positive(rank, dtype):
     inverted = inverse(positive_matrices(100, rank).astype(dtype), 1e-6, "numpy")
     assert np.isfinite(inverted).all()
     assert (np.diagonal(inverted, axis1=1, axis2=2) > 0).all()
 
 
-def test_product_with_a_vector() -> None:
+def test_product_with_a_vector():
     matrices, vectors = positive_matrices(50), np.random.default_rng(1).normal(size=(50, 3))
     entries = [matrices[:, i, j] for i, j in zip(ROWS, COLUMNS, strict=True)]
     found, expected = (
@@ -265,7 +264,7 @@ def noisy_pixels(lights: Tensor, noise: float) -> tuple[Tensor, Tensor]:
     return normals, 0.4 * normals @ lights.T + 0.4 * noise * errors
 
 
-def test_the_change_is_half_the_difference_of_two_halves() -> None:
+def test_the_change_is_half_the_difference_of_two_halves():
     """On a ring, the sums over either half are the same. So least squares with one half is the
     oracle.
     """
@@ -286,7 +285,7 @@ def test_the_change_is_half_the_difference_of_two_halves() -> None:
 
 @pytest.mark.parametrize("square", [False, True])
 @pytest.mark.parametrize("count", [4, 5, 10, 40])
-def test_noise_is_as_large_as_the_random_errors(count: int, square: bool) -> None:
+def test_noise_is_as_large_as_the_random_errors(count, square):
     """Also on a ring of four lights, whose residuals alternate as the signs of the halves do."""
     ring = directions_at(2 * np.pi * np.arange(count) / count, np.radians(35))
     lights = torch.tensor(ring if square else spiral_lights(count, 55))
@@ -298,7 +297,7 @@ def test_noise_is_as_large_as_the_random_errors(count: int, square: bool) -> Non
     assert noise == pytest.approx(float(error), rel=0.07)  # means of 2,000 squares
 
 
-def test_errors_that_all_pixels_share_are_no_noise() -> None:
+def test_errors_that_all_pixels_share_are_no_noise():
     """Wrong intensities turn all normals alike. What the halves disagree about is as smooth as the
     normals are.
     """
@@ -309,7 +308,7 @@ def test_errors_that_all_pixels_share_are_no_noise() -> None:
     assert (noise - fitted).abs().mean() < 0.1 * noise.abs().mean()
 
 
-def test_the_order_of_the_lights_changes_nothing() -> None:
+def test_the_order_of_the_lights_changes_nothing():
     _, observations = noisy_pixels(LIGHTS, 0.01)
     found = compare_halves(observations, LIGHTS, SIGNS)
     order = torch.randperm(10, generator=torch.Generator().manual_seed(3))
@@ -320,7 +319,7 @@ def test_the_order_of_the_lights_changes_nothing() -> None:
         torch.testing.assert_close(tuple(other), tuple(found))
 
 
-def test_three_lights_and_black_pixels_disagree_about_nothing() -> None:
+def test_three_lights_and_black_pixels_disagree_about_nothing():
     found = compare_halves(noisy_pixels(LIGHTS[:3], 0.01)[1], LIGHTS[:3], SIGNS[:3])
     assert found.change.abs().max() < 1e-6
     assert found.noise.isfinite().all()

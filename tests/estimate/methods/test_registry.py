@@ -37,7 +37,7 @@ def weights(tmp_path: Path) -> str:
     return save_tiny(tmp_path / "tiny.safetensors")
 
 
-def test_every_method_says_what_it_is_and_estimates(weights: str, tmp_path: Path) -> None:
+def test_every_method_says_what_it_is_and_estimates(weights, tmp_path):
     truth = np.array([[0.0, 0.0, 1.0], [0.28, 0.0, 0.96], [0.0, -0.28, 0.96]])
     observations = (truth @ LIGHTS.T * 0.5).astype(np.float32)
     alone = save_tiny(tmp_path / "alone.safetensors", interpolates=False)
@@ -59,7 +59,7 @@ def test_every_method_says_what_it_is_and_estimates(weights: str, tmp_path: Path
     assert len(fingerprints) == len(method_names())
 
 
-def test_what_decides_the_normals_is_in_the_fingerprint(weights: str) -> None:
+def test_what_decides_the_normals_is_in_the_fingerprint(weights):
     options = MethodOptions(weights=weights, device="cpu", precision="float32")
     others = (replace(options, rotations=3), replace(options, precision="bfloat16"))
     fingerprints = {make_estimator("spline-net", o).fingerprint for o in (options, *others)}
@@ -68,7 +68,7 @@ def test_what_decides_the_normals_is_in_the_fingerprint(weights: str) -> None:
     assert same.fingerprint in fingerprints
 
 
-def test_weights_of_the_other_network(weights: str, tmp_path: Path) -> None:
+def test_weights_of_the_other_network(weights, tmp_path):
     alone = save_tiny(tmp_path / "alone.safetensors", interpolates=False)
     for method, file, message in (
         (
@@ -87,12 +87,9 @@ def test_weights_of_the_other_network(weights: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("options", [MethodOptions(rotations=0), MethodOptions(batch_size=0)])
-def test_counts_from_one(options: MethodOptions, weights: str) -> None:
+def test_counts_from_one(options, weights):
     with pytest.raises(UsageError, match="whole numbers from 1"):
         make_estimator("spline-net", replace(options, weights=weights))
-
-
-Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
 SEE_CAPTURE = ("spline-net", "spline-net-pixelwise")
@@ -111,7 +108,7 @@ def largest_difference_deg(a: NDArray[np.floating], b: NDArray[np.floating]) -> 
 
 @pytest.mark.parametrize("name", method_names())
 @pytest.mark.parametrize("change", ["order of lights", "darker", "brighter", "batches", "turn"])
-def test_what_changes_nothing(name: str, change: str, glossy_pixels: Pixels) -> None:
+def test_what_changes_nothing(name, change, glossy_pixels):
     """But for CNN-PS, normals turn with the lights. That is only symmetric as far as its ten
     rotations go.
     """
@@ -133,7 +130,7 @@ def test_what_changes_nothing(name: str, change: str, glossy_pixels: Pixels) -> 
 
 @pytest.mark.parametrize("name", method_names())
 @pytest.mark.parametrize("n_lights", [3, 4, 14])
-def test_odd_pixels_still_get_a_normal(name: str, n_lights: int, glossy_pixels: Pixels) -> None:
+def test_odd_pixels_still_get_a_normal(name, n_lights, glossy_pixels):
     _, lights, observations = glossy_pixels
     odd = observations[:6, :n_lights].astype(np.float32)
     odd[0] = 0
@@ -147,7 +144,7 @@ def test_odd_pixels_still_get_a_normal(name: str, n_lights: int, glossy_pixels: 
 
 
 @pytest.mark.parametrize("name", method_names())
-def test_a_pixel_may_have_lights_of_its_own(name: str, glossy_pixels: Pixels) -> None:
+def test_a_pixel_may_have_lights_of_its_own(name, glossy_pixels):
     """Two pixels at a time, with shared lights, are the oracle for all pixels at once, with lights
     of their own.
 
@@ -174,7 +171,7 @@ def _about_view_axis(angle: float) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("count", [3, 4, 10, 96])
-def test_solves_the_normal_equations(count: int) -> None:
+def test_solves_the_normal_equations(count):
     observations = np.random.default_rng(0).uniform(size=(50, count))
     directions = spiral_lights(count)
     estimate = LeastSquares().estimate(observations, directions)

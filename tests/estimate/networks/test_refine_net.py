@@ -53,7 +53,7 @@ def features_of(observations: Tensor, lights: Tensor, normals: Tensor, error: Te
 
 @pytest.mark.parametrize("mirror", [False, True])
 @pytest.mark.parametrize("quarters", range(4))
-def test_features_turn_with_the_image(quarters: int, mirror: bool) -> None:
+def test_features_turn_with_the_image(quarters, mirror):
     generator = torch.Generator().manual_seed(1)
     lights = torch.nn.functional.normalize(
         torch.randn(8, 3, generator=generator) + torch.tensor((0.0, 0.0, 2.0)), dim=1
@@ -67,14 +67,14 @@ def test_features_turn_with_the_image(quarters: int, mirror: bool) -> None:
     shading = torch.einsum("fc,chw->fhw", lights, normals).clamp(min=0)
     observations = shading**1.5 + 0.05 * torch.rand(8, HEIGHT, WIDTH, generator=generator)
 
-    def turned(vectors: Tensor) -> Tensor:
+    def turned(vectors):
         """Vectors (3, ...), turned."""
         x, y, z = (-vectors[0] if mirror else vectors[0]), vectors[1], vectors[2]
         for _ in range(quarters):
             x, y = -y, x
         return torch.stack((x, y, z))
 
-    def moved(maps: Tensor) -> Tensor:
+    def moved(maps):
         return (maps.flip(-1) if mirror else maps).rot90(quarters, (-2, -1))
 
     expected = features_of(
@@ -91,7 +91,7 @@ def test_features_turn_with_the_image(quarters: int, mirror: bool) -> None:
 
 
 @pytest.mark.parametrize("twice", [False, True])
-def test_a_new_net_changes_nothing(twice: bool) -> None:
+def test_a_new_net_changes_nothing(twice):
     features, mask = random_maps(12, 15)
     features[:, :3] = torch.nn.functional.normalize(features[:, :3], dim=1)
     normals, error = RefineNet(twice=twice)(features, mask)
@@ -100,7 +100,7 @@ def test_a_new_net_changes_nothing(twice: bool) -> None:
     torch.testing.assert_close(error, error_before * mask)
 
 
-def test_a_second_net_reads_the_results_of_the_first() -> None:
+def test_a_second_net_reads_the_results_of_the_first():
     features, mask = random_maps(12, 16)
     both = random_net(twice=True)
     assert both.again is not None
@@ -123,7 +123,7 @@ def test_a_second_net_reads_the_results_of_the_first() -> None:
 
 
 @pytest.mark.parametrize("twice", [False, True])
-def test_outside_of_the_mask_is_outside_of_the_image(twice: bool) -> None:
+def test_outside_of_the_mask_is_outside_of_the_image(twice):
     features, mask = random_maps(20, 24)
     wide = torch.nn.functional.pad(features, (COARSEST, 9, 2 * COARSEST, 3))
     wide_mask = torch.nn.functional.pad(mask, (COARSEST, 9, 2 * COARSEST, 3))
@@ -136,7 +136,7 @@ def test_outside_of_the_mask_is_outside_of_the_image(twice: bool) -> None:
 
 @pytest.mark.parametrize("twice", [False, True])
 @pytest.mark.parametrize("turned", [False, True])
-def test_nothing_beyond_the_reach_counts(turned: bool, twice: bool) -> None:
+def test_nothing_beyond_the_reach_counts(turned, twice):
     """Along a strip that is as wide as two of the coarsest cells."""
     net = random_net(twice=twice).double()
     size = 2 * net.reach + COARSEST
@@ -167,7 +167,7 @@ def network() -> SplineNet:
     return random_network(**SEES, sees_capture=True)
 
 
-def test_at_first_a_capture_says_nothing() -> None:
+def test_at_first_a_capture_says_nothing():
     alone, seeing = (
         SplineNet(NetworkConfig(**SEES, sees_capture=sees)).eval() for sees in (False, True)
     )
@@ -182,7 +182,7 @@ def test_at_first_a_capture_says_nothing() -> None:
         assert torch.equal(found, expected)
 
 
-def test_a_sample_of_all_pixels_is_the_capture_itself(network: SplineNet) -> None:
+def test_a_sample_of_all_pixels_is_the_capture_itself(network):
     observations, lights = pixels(20)
     context = network.encode_context(observations, lights)
     whole = network(observations, lights)
@@ -201,7 +201,7 @@ def test_a_sample_of_all_pixels_is_the_capture_itself(network: SplineNet) -> Non
     torch.testing.assert_close(again.normals, whole.normals, atol=3e-5, rtol=0)
 
 
-def test_captures_of_a_batch_do_not_see_each_other(network: SplineNet) -> None:
+def test_captures_of_a_batch_do_not_see_each_other(network):
     captures = [pixels(9, seed) for seed in (0, 10, 20)]
     # Pixel p belongs to capture p % 3.
     observations = torch.stack([seen for seen, _ in captures], dim=1).flatten(0, 1)
@@ -217,8 +217,8 @@ def test_captures_of_a_batch_do_not_see_each_other(network: SplineNet) -> None:
 
 
 def test_the_exposure_of_a_capture_does_not_matter_but_the_brightness_of_a_pixel_does(
-    network: SplineNet,
-) -> None:
+    network,
+):
     observations, lights = pixels(16)
     whole = network(observations, lights).normals
     torch.testing.assert_close(network(37 * observations, lights).normals, whole, atol=1e-5, rtol=0)
@@ -226,7 +226,7 @@ def test_the_exposure_of_a_capture_does_not_matter_but_the_brightness_of_a_pixel
     assert (network(darker, lights).normals - whole).abs().max() > 1e-3
 
 
-def test_attention_and_mean_are_those_of_the_formulas() -> None:
+def test_attention_and_mean_are_those_of_the_formulas():
     """One capture, computed once more pixel by pixel and head by head in float64."""
     torch.manual_seed(0)
     layer = ContextLayer(16).double()

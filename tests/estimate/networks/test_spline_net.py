@@ -41,7 +41,7 @@ def pixels() -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(5)
     lights = PixelGenerator(config, generator).draw(1).light_directions[0].double()
     scene = PixelGenerator(config, generator).draw(64).truth
-    return scene.radiance(lights.float()).double(), torch.nn.functional.normalize(lights, dim=1)
+    return scene.radiance(lights.float()).double(), torch.nn.functional.normalize(lights, dim=1)  # type: ignore[attr-defined]
 
 
 def turn(vectors: Tensor, degrees: float) -> Tensor:
@@ -50,8 +50,8 @@ def turn(vectors: Tensor, degrees: float) -> Tensor:
 
 
 def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(
-    pixels: tuple[Tensor, Tensor],
-) -> None:
+    pixels,
+):
     observations, lights = pixels
     network = SplineNet(NetworkConfig(**TINY)).double()
     expected = torch.nn.functional.normalize(
@@ -101,7 +101,7 @@ def test_observations_that_are_not_valid_do_not_matter(pixels, settings):
         )
 
 
-def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(pixels: tuple[Tensor, Tensor]) -> None:
+def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(pixels):
     # Turned by t and then mirrored is mirrored and then turned by -t.
     observations, lights = pixels
     network = random_network().double()
@@ -114,7 +114,7 @@ def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(pixels: tuple[Tensor
 
 
 @pytest.mark.parametrize("mirror", [False, True])
-def test_frames_there_and_back(pixels: tuple[Tensor, Tensor], mirror: bool) -> None:
+def test_frames_there_and_back(pixels, mirror):
     observations, lights = pixels
     network = random_network().double()
     views = network.build_maps(
@@ -131,7 +131,7 @@ def test_frames_there_and_back(pixels: tuple[Tensor, Tensor], mirror: bool) -> N
     torch.testing.assert_close(azimuth[tilted], expected[tilted].double(), atol=1e-4, rtol=0)
 
 
-def test_autocast_does_not_round_the_geometry(pixels: tuple[Tensor, Tensor]) -> None:
+def test_autocast_does_not_round_the_geometry(pixels):
     observations, lights = pixels[0].float(), pixels[1].float()
     network = random_network()
     for parameter in network.ne_net.out.parameters():
@@ -143,7 +143,7 @@ def test_autocast_does_not_round_the_geometry(pixels: tuple[Tensor, Tensor]) -> 
 
 
 @pytest.mark.parametrize(("median_deg", "shape"), [(0.5, 1.0), (4.0, 2.5), (30.0, 0.7)])
-def test_a_log_logistic_distribution(median_deg: float, shape: float) -> None:
+def test_a_log_logistic_distribution(median_deg, shape):
     error = torch.tensor(
         [[math.log(math.radians(median_deg)), math.log(shape)]], dtype=torch.float64
     )
@@ -159,7 +159,7 @@ def test_a_log_logistic_distribution(median_deg: float, shape: float) -> None:
     np.testing.assert_allclose(found, -logistic.logpdf(np.log(angles_deg + 0.1)))
 
 
-def test_it_changes_no_normal() -> None:
+def test_it_changes_no_normal():
     plain, telling = random_network(fits=["ls"]), random_network(fits=["ls"], error_head=True)
     telling.load_state_dict(plain.state_dict(), strict=False)
     generator = torch.Generator().manual_seed(1)
@@ -177,7 +177,7 @@ def test_it_changes_no_normal() -> None:
 
 
 @pytest.mark.parametrize("n_maps", [1, 300])
-def test_few_products_give_the_features_of_the_convolutions(n_maps: int) -> None:
+def test_few_products_give_the_features_of_the_convolutions(n_maps):
     encoder = MapEncoder(3, 24, 2, 16)
     for parameter in encoder.parameters():
         nn.init.normal_(parameter, std=0.1)
@@ -203,7 +203,7 @@ def draw_pixels(count: int, lights: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "iw12-all"])
-def test_they_are_the_methods_of_these_names(name: str) -> None:
+def test_they_are_the_methods_of_these_names(name):
     observations, directions = draw_pixels(20, 12)
     shared = directions[0]
     expected = make_estimator(name, MethodOptions(device="cpu")).estimate(
@@ -214,7 +214,7 @@ def test_they_are_the_methods_of_these_names(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_pixel_has_its_own_lights_and_their_number(name: str) -> None:
+def test_each_pixel_has_its_own_lights_and_their_number(name):
     observations, directions = draw_pixels(9, 12)
     count = torch.tensor([12, 11, 10, 9, 8, 7, 6, 5, 4])
     valid = torch.arange(12) < count[:, None]
@@ -225,7 +225,7 @@ def test_each_pixel_has_its_own_lights_and_their_number(name: str) -> None:
         torch.testing.assert_close(found[pixel : pixel + 1], alone, atol=1e-4, rtol=0)
 
 
-def test_pixels_that_no_fit_can_tell_anything_of() -> None:
+def test_pixels_that_no_fit_can_tell_anything_of():
     directions = draw_pixels(1, 6)[1][0]
     observations = torch.tensor([[0.0] * 6, [1.0] + [0.0] * 5, [-0.2] * 5 + [1.0]])
     found = fit_normals(NAMES, observations, directions)

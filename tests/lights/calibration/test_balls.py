@@ -34,9 +34,7 @@ def ball(tmp_path: Path, render_ball: Render, lights: NDArray[np.float64]) -> Pa
 
 
 @pytest.mark.parametrize("outline", ["--circle", "mask", "picture", "reference"])
-def test_lights_of_a_ball(
-    ball: Path, render_ball: Render, lights: NDArray[np.float64], outline: str
-) -> None:
+def test_lights_of_a_ball(ball, render_ball, lights, outline):
     if outline == "mask":
         write(ball, "mask.png", BALL.inside((180, 210)).astype(np.float64))
     if outline == "reference":
@@ -73,7 +71,7 @@ def test_several_balls_are_averaged(ball, tmp_path, render_ball, lights):
     assert combine_balls([one]).disagreement_deg.tolist() == [0] * 7
 
 
-def test_pictures_of_another_size(ball: Path) -> None:
+def test_pictures_of_another_size(ball):
     write(ball, "3.png", np.zeros((50, 60)))
     for circle in (BALL, None):
         with pytest.raises(
@@ -82,7 +80,7 @@ def test_pictures_of_another_size(ball: Path) -> None:
             calibrate_ball(find_ball_files(ball), circle=circle)
 
 
-def test_real_balls(shared_data: Path) -> None:
+def test_real_balls(shared_data):
     chrome = calibrate_ball(find_ball_files(shared_data / "uw/chrome"))
     off = angle_between_deg(
         chrome.directions, read_light_directions(shared_data / "uw/gray/light_directions.txt")

@@ -12,7 +12,7 @@ from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.errors import InputError
 from splinecli.lights.calibration.balls import find_ball_files
 from splinecli.lights.calibration.circle import Circle
-from splinecli.lights.calibration.lamps import Target, measure_light_intensities
+from splinecli.lights.calibration.lamps import measure_light_intensities
 
 BALL = Circle(40.0, 42.0, 30.0)
 INTENSITIES = np.array([(1.0, 0.8, 0.6), (0.5, 0.5, 0.7), (1.3, 1.2, 1.0)])
@@ -34,7 +34,7 @@ def ball_images() -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("target", ["card", "ball"])
 @pytest.mark.parametrize("brightest", [1.25, 3.0])
-def test_12_bit_values_in_16_bit_files(tmp_path: Path, target: Target, brightest: float) -> None:
+def test_12_bit_values_in_16_bit_files(tmp_path, target, brightest):
     """One lamp is clipped at 4095, for a share of the target or for all of a card, and no tag says
     so.
     """
@@ -57,7 +57,7 @@ def test_12_bit_values_in_16_bit_files(tmp_path: Path, target: Target, brightest
     np.testing.assert_allclose(found[:, 0] / found[0, 0], intensities, rtol=0.03)
 
 
-def test_images_and_masks_of_another_size_and_a_ball_without_a_mask(tmp_path: Path) -> None:
+def test_images_and_masks_of_another_size_and_a_ball_without_a_mask(tmp_path):
     folder = write(tmp_path / "card", np.full((3, 20, 30, 3), 0.5), None)
     with pytest.raises(InputError, match="images of the gray ball need a mask"):
         measure_light_intensities(find_ball_files(folder), LIGHTS, "ball")
@@ -76,7 +76,7 @@ def test_images_and_masks_of_another_size_and_a_ball_without_a_mask(tmp_path: Pa
 
 
 @pytest.mark.parametrize("exposure", [1.0, 1.7], ids=["whole", "partly saturated"])
-def test_a_ball(tmp_path: Path, exposure: float) -> None:
+def test_a_ball(tmp_path, exposure):
     images = (ball_images() * exposure).clip(0, 1)
     assert (images == 1).any() == (exposure > 1)
     folder = write(tmp_path / "gray", images, BALL.inside(images.shape[1:3]))
@@ -85,7 +85,7 @@ def test_a_ball(tmp_path: Path, exposure: float) -> None:
 
 
 @pytest.mark.parametrize(("gamma", "ambient"), [(1.0, 0.0), (2.2, 0.0), (1.0, 0.1)])
-def test_a_card(tmp_path: Path, gamma: float, ambient: float) -> None:
+def test_a_card(tmp_path, gamma, ambient):
     images = np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * INTENSITIES)[:, None, None]
     folder = write(tmp_path / "card", (images + ambient) ** (1 / gamma), None)
     if ambient:

@@ -63,7 +63,7 @@ def calibrate(
     return balls
 
 
-def test_rays_that_meet() -> None:
+def test_rays_that_meet():
     points = np.array([(1.0, 2.0, 5.0), (-3.0, 0.5, 4.0), (0.0, 0.0, 9.0)])
     starts = np.array([[(-1.0, 0.0, 0.0)] * 3, [(1.0, 0.2, 0.0)] * 3])
     found, miss = intersect_rays(starts, unit(points - starts))
@@ -124,7 +124,7 @@ def photographed(
         radius = float(np.hypot(*(outline - (x, y)).T).mean())
         outline += (outline - (x, y)) * (0.3 * rng.normal() / radius) + 0.3 * rng.normal(size=2)
         circle = Circle(float(x), float(y), radius, points=outline)
-        marks = tuple(Highlight(*point, 0.0) for point in highlights.tolist())
+        marks = tuple(Highlight(*point, 0.0) for point in highlights.tolist())  # type: ignore[call-arg]
         files = BallFiles(Path("ball"), (), None, None)
         balls.append(
             BallCalibration(files, circle, "--circle", marks, towards, normals, view, PIXELS)
@@ -133,7 +133,7 @@ def photographed(
 
 
 @pytest.mark.parametrize("source", ["--camera-matrix", "EXIF", "assumed distant"])
-def test_the_uncertainty_covers_the_error(source: str) -> None:
+def test_the_uncertainty_covers_the_error(source):
     """Cameras at 5 to 100 widths of the object: 9 of 10 errors or more are within the stated
     uncertainty.
     """
@@ -156,7 +156,7 @@ def test_the_uncertainty_covers_the_error(source: str) -> None:
         assert np.mean(errors) < 0.03
 
 
-def test_two_balls_give_positions(tmp_path: Path, render_ball: Render) -> None:
+def test_two_balls_give_positions(tmp_path, render_ball):
     """Two balls 250 pixels apart, and lamps 1,200 pixels away: about five times as far."""
     balls = calibrate(tmp_path, render_ball, lamps(1200.0))
     found = triangulate_lamps(balls, ball_diameter=40.0)
@@ -177,7 +177,7 @@ def test_two_balls_give_positions(tmp_path: Path, render_ball: Render) -> None:
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_lamps_without_positions(tmp_path: Path, render_ball: Render, known: bool) -> None:
+def test_lamps_without_positions(tmp_path, render_ball, known):
     """Distant lamps, and near ones that an unknown camera photographs."""
     balls = calibrate(tmp_path, render_ball, lamps(1e6 if known else 1500.0), known=known)
     found = triangulate_lamps(balls)
@@ -223,7 +223,7 @@ def directions() -> NDArray[np.float64]:
     return unit(np.array([(0.0, 0.0, 1.0)] * 4))
 
 
-def test_one_ball(directions: NDArray[np.float64]) -> None:
+def test_one_ball(directions):
     found = report([ball(directions)])
     assert json.loads(json.dumps(found)) == found
     assert (found["n_lights"], found["disagreement_deg"], found["compared"]) == (4, None, None)
@@ -237,7 +237,7 @@ def test_one_ball(directions: NDArray[np.float64]) -> None:
 
 
 @pytest.mark.parametrize(("degrees", "warned"), [(9.8, False), (10.2, True)])
-def test_balls_that_disagree(directions: NDArray[np.float64], degrees: float, warned: bool) -> None:
+def test_balls_that_disagree(directions, degrees, warned):
     # The mean of two directions lies half-way, so each differs from it by half the angle; the limit
     # is 5 degrees.
     found = report([ball(directions), ball(turned(directions, degrees))])
@@ -248,7 +248,7 @@ def test_balls_that_disagree(directions: NDArray[np.float64], degrees: float, wa
     )
 
 
-def test_a_compared_file(directions: NDArray[np.float64]) -> None:
+def test_a_compared_file(directions):
     lights = turned(directions, 40)
     found = report([ball(lights)], turned(lights, 2))
     assert found["compared"] == {"mean_deg": 2.0, "largest_deg": 2.0}

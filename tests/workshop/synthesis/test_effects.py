@@ -30,7 +30,7 @@ from splinecli.workshop.synthesis.lights import draw_light_counts, draw_light_di
 from splinecli.workshop.synthesis.pixels import Wall, draw_ambient, draw_visible_normals, draw_wall
 
 
-def test_walls_have_the_stated_shapes() -> None:
+def test_walls_have_the_stated_shapes():
     normals = draw_visible_normals(N, generator(1))
     wall = draw_wall(normals, 0.4, generator())
     present = wall.tan_height[:, 0] > 0
@@ -75,7 +75,7 @@ def mirror(pixels: int) -> PrincipledMaterial:
     )
 
 
-def test_matte_walls_reflect_by_the_cosine_law_twice() -> None:
+def test_matte_walls_reflect_by_the_cosine_law_twice():
     normals = draw_visible_normals(50, generator(1))
     wall = replace(
         draw_wall(normals, 1.0, generator()),
@@ -92,7 +92,7 @@ def test_matte_walls_reflect_by_the_cosine_law_twice() -> None:
     assert not wall.reflected(normals, matte(50), -wall.facing[:, None]).any()
 
 
-def test_a_metal_wall_throws_its_highlight_where_the_metal_shows_it() -> None:
+def test_a_metal_wall_throws_its_highlight_where_the_metal_shows_it():
     """Light, wall and pixel set up as two mirrors: light comes from the side, by way of the wall,
     to the camera.
     """
@@ -111,7 +111,7 @@ def test_a_metal_wall_throws_its_highlight_where_the_metal_shows_it() -> None:
     assert wall.reflected(away, mirror(1), lights).max() < 0.5
 
 
-def test_a_known_wall_hides_the_lights_behind_it() -> None:
+def test_a_known_wall_hides_the_lights_behind_it():
     wall = replace(
         draw_wall(draw_visible_normals(1, generator()), 1.0, generator()),
         azimuth=torch.tensor([[0.0, 1.0, 0.0]]),
@@ -120,7 +120,7 @@ def test_a_known_wall_hides_the_lights_behind_it() -> None:
         softness=torch.tensor([[0.01]]),
     )
 
-    def towards(azimuth_deg: float, elevation_deg: float) -> list[float]:
+    def towards(azimuth_deg, elevation_deg):
         a, e = math.radians(azimuth_deg), math.radians(elevation_deg)
         return [math.cos(e) * math.sin(a), math.cos(e) * math.cos(a), math.sin(e)]
 
@@ -134,7 +134,7 @@ def test_a_known_wall_hides_the_lights_behind_it() -> None:
     assert wall.visibility(lights)[0].tolist() == [0, 1, 0, 1, 0, 1, 1]
 
 
-def test_ambient_light() -> None:
+def test_ambient_light():
     ambient = draw_ambient(N, 0.3, generator())
     assert ambient.shape == (N, 1) and (ambient > 0).float().mean().item() == pytest.approx(
         0.3, abs=SHARE
@@ -149,7 +149,7 @@ def tilted_lights(pixels: int, lights: int) -> Tensor:
     return torch.nn.functional.normalize(directions, dim=-1)
 
 
-def test_errors_of_light_directions() -> None:
+def test_errors_of_light_directions():
     directions = tilted_lights(4000, 40)
     moved = disturb_light_directions(directions, 0.6, generator())
     torch.testing.assert_close(moved.norm(dim=-1), torch.ones(4000, 40))
@@ -167,7 +167,7 @@ def test_errors_of_light_directions() -> None:
     )
 
 
-def test_errors_of_light_intensities() -> None:
+def test_errors_of_light_intensities():
     observations = torch.rand(4000, 100, generator=generator(3)) + 0.5
     factor = (disturb_light_intensities(observations, 0.6, generator()) / observations).numpy()
     sigma = np.sqrt(((factor - 1) ** 2).mean(axis=1))
@@ -178,7 +178,7 @@ def test_errors_of_light_intensities() -> None:
     assert torch.equal(disturb_light_intensities(observations, 0.0, generator()), observations)
 
 
-def test_exposure() -> None:
+def test_exposure():
     radiance = torch.rand(N, 5, generator=generator(3)) * 30
     brightest = (radiance * draw_exposure(radiance, 0.25, generator())).amax(dim=1)
     over = brightest > 1
@@ -200,7 +200,7 @@ def mean_square_of_power(low: float, high: float) -> float:
 
 
 @pytest.mark.parametrize("level", [0.5, 0.1])
-def test_sensor_noise(level: float) -> None:
+def test_sensor_noise(level):
     noisy = add_sensor_noise(torch.full((N, 20), level), generator())
     expected = mean_square_of_power(-4, -2.5) + level * mean_square_of_power(-3.5, -2)
     variance = (noisy.double() - level).square().mean().item()
@@ -213,7 +213,7 @@ def is_multiple(values: Tensor, steps: float) -> Tensor:
     return ((values * steps - (values * steps).round()).abs() < 1e-6).all(dim=1)
 
 
-def test_quantisation() -> None:
+def test_quantisation():
     exposed = torch.rand(N, 8, generator=generator(3), dtype=torch.float64)
     quantised = quantise(exposed, 0.3, generator())
     decoded = torch.from_numpy(
@@ -237,7 +237,7 @@ def test_quantisation() -> None:
     assert (quantise(exposed, 0.0, generator()) - exposed).abs().max() <= 0.5 / 1023 + 1e-9
 
 
-def test_light_intensities() -> None:
+def test_light_intensities():
     intensities = draw_light_intensities(N, 10, 0.4, generator())
     assert intensities.amax(dim=1).sub(1).abs().max() == 0
     unequal = intensities.amin(dim=1) < 1
@@ -248,7 +248,7 @@ def test_light_intensities() -> None:
     assert not (draw_light_intensities(N, 10, 0.0, generator()) != 1).any()
 
 
-def test_restoring_half_of_the_clipped_pixels() -> None:
+def test_restoring_half_of_the_clipped_pixels():
     lights = tilted_lights(400, 12)
     normals = torch.nn.functional.normalize(
         torch.randn(400, 3, generator=generator(5)) * 0.3 + torch.tensor((0, 0, 1))
@@ -278,14 +278,14 @@ def centred_rigs(kind: str, pixels: int, lights: int) -> NDArray[np.float64]:
     return points - points.mean(axis=1, keepdims=True)
 
 
-def test_half_of_the_draws_have_about_the_usual_number() -> None:
+def test_half_of_the_draws_have_about_the_usual_number():
     random = torch.Generator().manual_seed(0)
     draws = [draw_light_counts(50, 4, 96, 10, random).numpy() for _ in range(4000)]
     largest = np.array([counts.max() for counts in draws])
     assert largest.min() >= 4
     assert largest.max() >= 90
 
-    def log_uniform(most: int) -> float:
+    def log_uniform(most):
         return math.log((most + 1) / 4) / math.log(97 / 4)
 
     # Four standard deviations of a share of 4000 are at most 0.03.
@@ -295,14 +295,14 @@ def test_half_of_the_draws_have_about_the_usual_number() -> None:
     assert all(counts.min() >= np.floor(0.8 * counts.max()) for counts in draws)
 
 
-def test_directions_are_unit_vectors_above_the_horizon() -> None:
+def test_directions_are_unit_vectors_above_the_horizon():
     directions = draw_light_directions(2000, 30, torch.Generator().manual_seed(0))
     assert directions.shape == (2000, 30, 3) and directions.norm(dim=-1).sub(1).abs().max() < 1e-6
     # Nothing lies outside 0.996 of the disc, where z = sqrt(1 - 0.996^2) = 0.0894.
     assert directions[..., 2].min() == pytest.approx(0.0894, abs=1e-3)
 
 
-def test_rigs_are_ellipses_of_the_stated_axes() -> None:
+def test_rigs_are_ellipses_of_the_stated_axes():
     centred = centred_rigs("ellipse", 1500, 1000)
     # A uniform ellipse has variances of a quarter of its half-axes squared.
     axes = 2 * np.sqrt(np.linalg.eigvalsh(np.einsum("pfi,pfj->pij", centred, centred) / 1000))
@@ -318,7 +318,7 @@ def test_rigs_are_ellipses_of_the_stated_axes() -> None:
     )
 
 
-def test_cones_are_narrow() -> None:
+def test_cones_are_narrow():
     centred = centred_rigs("cone", 500, 400)
     radius_deg = np.degrees(np.arcsin(np.linalg.norm(centred, axis=2).max(axis=1)))
     # The mean of 400 lights is off by some hundredths of the radius.
@@ -326,7 +326,7 @@ def test_cones_are_narrow() -> None:
     assert radius_deg.max() < 22
 
 
-def test_rings_have_one_elevation() -> None:
+def test_rings_have_one_elevation():
     directions = draw_rigs("ring", 500, 200)
     polar_deg = np.degrees(np.arccos(directions[..., 2]))
     assert stats.kstest(polar_deg.mean(axis=1), stats.uniform(15, 60).cdf).statistic < 0.08
@@ -340,13 +340,13 @@ def test_rings_have_one_elevation() -> None:
     assert off_axis.max() < math.sin(math.radians(60)) / math.radians(60) + 0.05
 
 
-def test_lines_lie_nearly_in_a_plane() -> None:
+def test_lines_lie_nearly_in_a_plane():
     centred = centred_rigs("line", 500, 400)
     across = np.sqrt(np.linalg.eigvalsh(np.einsum("pfi,pfj->pij", centred, centred) / 400)[:, 0])
     assert stats.kstest(np.degrees(np.arcsin(across)), stats.uniform(1, 9).cdf).statistic < 0.1
 
 
-def test_hand_held_lights_come_in_clusters() -> None:
+def test_hand_held_lights_come_in_clusters():
     directions = draw_rigs("hand-held", 500, 12)
     angles = np.degrees(np.arccos(np.clip(directions @ directions.transpose(0, 2, 1), -1, 1)))
     angles += 360 * np.eye(12)

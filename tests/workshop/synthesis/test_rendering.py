@@ -84,7 +84,7 @@ def directions(*vectors: tuple[float, float, float]) -> np.ndarray:
     return lights / np.linalg.norm(lights, axis=1, keepdims=True)
 
 
-def test_a_matte_ball_is_lambert_s_law_and_lights_nothing_of_itself() -> None:
+def test_a_matte_ball_is_lambert_s_law_and_lights_nothing_of_itself():
     tracer = Tracer(ball(0.9, polar=90, inward=False))
     visible = find_visible_surface(tracer, 64, 3)
     centres = pixel_centres(visible.mask)
@@ -122,7 +122,7 @@ def floor_with_wall() -> Mesh:
     )
 
 
-def test_a_wall_casts_its_shadow() -> None:
+def test_a_wall_casts_its_shadow():
     tracer = Tracer(floor_with_wall())
     visible = find_visible_surface(tracer, 50, 2)
     # At 45 degrees behind the wall the shadow is as long as the wall is high; from the front there
@@ -144,7 +144,7 @@ def test_a_wall_casts_its_shadow() -> None:
     assert np.abs(direct[behind, 1]).max() == 0
 
 
-def test_a_point_of_light_follows_lamberts_law_and_the_wall_throws_its_shadow() -> None:
+def test_a_point_of_light_follows_lamberts_law_and_the_wall_throws_its_shadow():
     """The cosine is h / d and the falloff (d0 / d)^2, so the radiance is albedo h d0^2 / d^3."""
     tracer = Tracer(floor_with_wall())
     visible = find_visible_surface(tracer, 50, 1)
@@ -165,7 +165,7 @@ def test_a_point_of_light_follows_lamberts_law_and_the_wall_throws_its_shadow() 
 
 
 @pytest.mark.parametrize("bounces", [1, 4])
-def test_light_between_the_walls_of_a_bowl(bounces: int) -> None:
+def test_light_between_the_walls_of_a_bowl(bounces):
     # From any point of a sphere every part of it of area dA has the form factor dA / (4 pi R^2). A
     # half sphere of reflectance rho, its mouth to the light: the flux pi R^2 falls in, rho of it is
     # spread evenly, and of what is spread a half meets the bowl again.
@@ -188,7 +188,7 @@ def test_light_between_the_walls_of_a_bowl(bounces: int) -> None:
         assert indirect[part].mean() == pytest.approx(expected, rel=0.05)
 
 
-def test_patches_have_their_own_material() -> None:
+def test_patches_have_their_own_material():
     tracer = Tracer(floor_with_wall())
     visible = find_visible_surface(tracer, 20, 2)
     materials = {"matte": Matte(torch.tensor([[0.25], [1.0]]))}
@@ -202,7 +202,7 @@ def test_patches_have_their_own_material() -> None:
     np.testing.assert_allclose(direct[above], 1.0, rtol=1e-5)
 
 
-def test_pixels_on_the_outline_are_as_bright_as_their_share_of_the_surface() -> None:
+def test_pixels_on_the_outline_are_as_bright_as_their_share_of_the_surface():
     corners = np.array([(-0.5, -0.5, 0), (0.7, -0.5, 0), (0.7, 0.5, 0), (-0.5, 0.5, 0)], np.float32)
     up = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
     tracer = Tracer(Mesh(corners, np.array([(0, 1, 2), (0, 2, 3)], np.int32), up))

@@ -29,7 +29,7 @@ def disc(size: int = 40) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_object_stays(seed: int) -> None:
+def test_the_object_stays(seed):
     mask = disc()
     maps = torch.rand(9, 40, 40, generator=torch.Generator().manual_seed(9)) + 0.2
     found, shown = add_background(maps, mask, LIGHTS, torch.Generator().manual_seed(seed))
@@ -47,7 +47,7 @@ def test_the_object_stays(seed: int) -> None:
     assert bool((length == 0).all()) or torch.allclose(length, torch.ones_like(length))
 
 
-def test_shadows_fall_away_from_the_light() -> None:
+def test_shadows_fall_away_from_the_light():
     """A light at the right, 45 degrees up, moves the shadow left by the distance; one above moves
     it down.
     """
@@ -61,7 +61,7 @@ SIZE = 48
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_piece(seed: int) -> None:
+def test_a_piece(seed):
     normals, radiance, mask = draw_engraved(SIZE, LIGHTS, torch.Generator().manual_seed(seed))
     assert mask.shape == (SIZE, SIZE)
     pixels = int(mask.sum())
@@ -74,7 +74,7 @@ def test_a_piece(seed: int) -> None:
     assert torch.equal(again[0], normals) and torch.equal(again[1], radiance)
 
 
-def test_round_pieces_turn_away_at_their_rim() -> None:
+def test_round_pieces_turn_away_at_their_rim():
     """On average, the normals point away from the middle, and more so further out."""
     for seed in range(6):
         normals, _, mask = draw_engraved(
@@ -111,7 +111,7 @@ def spread(kernel: torch.Tensor) -> float:
 
 
 @pytest.mark.parametrize("sigma", [0.6, 0.9, 1.2])
-def test_kernels_have_the_width_that_they_state(sigma: float) -> None:
+def test_kernels_have_the_width_that_they_state(sigma):
     assert spread(gaussian_kernel(sigma)) == pytest.approx(sigma, rel=0.05)
     # The mean over a pixel adds the variance of its own width, a twelfth.
     assert spread(disc_kernel(sigma)) == pytest.approx(np.sqrt(sigma**2 + 1 / 12), rel=0.08)
@@ -119,7 +119,7 @@ def test_kernels_have_the_width_that_they_state(sigma: float) -> None:
         assert float(kernel.sum()) == pytest.approx(1)
 
 
-def test_a_lens_spreads_a_point_into_its_kernel() -> None:
+def test_a_lens_spreads_a_point_into_its_kernel():
     image = torch.zeros(1, 11, 11)
     image[0, 5, 5] = 1
     kernel = gaussian_kernel(0.7)
@@ -130,7 +130,7 @@ def test_a_lens_spreads_a_point_into_its_kernel() -> None:
 
 
 @pytest.mark.parametrize("code", [cv2.COLOR_BayerRGGB2RGB, cv2.COLOR_BayerRGGB2RGB_EA])
-def test_a_bayer_pattern_keeps_ramps_and_blurs_points(code: int) -> None:
+def test_a_bayer_pattern_keeps_ramps_and_blurs_points(code):
     """Linear interpolation is exact on a ramp, whichever colours the ramp has. A point spreads."""
     ramp = (0.1 + 0.05 * torch.arange(12.0)).expand(1, 12, 12)
     colours = torch.stack((0.5 * ramp, ramp, 0.8 * ramp))
@@ -144,7 +144,7 @@ def test_a_bayer_pattern_keeps_ramps_and_blurs_points(code: int) -> None:
     assert float(seen[0, 6, 7]) == pytest.approx(0.125, abs=1e-3)
 
 
-def test_sharpening_raises_contrast_and_jpeg_keeps_flat_areas() -> None:
+def test_sharpening_raises_contrast_and_jpeg_keeps_flat_areas():
     edge = torch.cat((torch.full((1, 16, 8), 0.2), torch.full((1, 16, 8), 0.6)), dim=2)
     sharp = camera(sharpening=0.8).develop(edge.expand(3, 1, 16, 16))
     assert float(sharp[0, 8, 7]) < 0.19 and float(sharp[0, 8, 8]) > 0.61
@@ -156,7 +156,7 @@ def test_sharpening_raises_contrast_and_jpeg_keeps_flat_areas() -> None:
     torch.testing.assert_close(camera(quality=90).compress(flat), flat, atol=3e-3, rtol=0)
 
 
-def test_light_that_scatters_stays_in_the_object() -> None:
+def test_light_that_scatters_stays_in_the_object():
     mask = torch.zeros(20, 20, dtype=torch.bool)
     mask[4:16, 4:16] = True
     radiance = torch.rand(3, 20, 20, generator=torch.Generator().manual_seed(0)) * mask

@@ -6,14 +6,12 @@ import socket
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 
 from splinecli.estimate.networks.weights import load_weights
-from splinecli.workshop.training import METRICS
-from splinecli.workshop.training.config import TrainingConfig
-from splinecli.workshop.training.loop import WEIGHTS, Trainer
+from splinecli.workshop.training import METRICS, WEIGHTS
+from splinecli.workshop.training.loop import Trainer
 from splinecli.workshop.training.run_files import read_metrics
 
 CPU = torch.device("cpu")
@@ -55,7 +53,7 @@ os._exit(0)
 """
 
 
-def test_two_processes_compute_what_one_does(tiny: TrainingConfig, tmp_path: Path) -> None:
+def test_two_processes_compute_what_one_does(tiny, tmp_path):
     config = replace(tiny, symmetric_weight=0.02, asymmetric_weight=1e-4, ne_net_updates=2)
     configs = {"joint": config, "alternating": replace(config, updates="alternating")}
     text = json.dumps({name: values.to_dict() for name, values in configs.items()})
@@ -111,7 +109,7 @@ run()
 """
 
 
-def test_a_run_outlives_one_of_its_processes(tmp_path: Path) -> None:
+def test_a_run_outlives_one_of_its_processes(tmp_path):
     # On the processor, one process of two is killed after the first checkpoint; torchrun starts
     # both again.
     (tmp_path / "worker.py").write_text(FAILING)

@@ -44,7 +44,7 @@ def scene(pixels: int = 300, lights: int = 8) -> tuple[torch.Tensor, torch.Tenso
     return torch.rand(pixels, lights, generator=generator), directions
 
 
-def test_a_flawless_capture_is_the_radiance_at_one_exposure() -> None:
+def test_a_flawless_capture_is_the_radiance_at_one_exposure():
     radiance, directions = scene()
     observations, calibrated, _ = photograph_scene(
         radiance, directions, FLAWLESS, torch.Generator().manual_seed(0)
@@ -55,7 +55,7 @@ def test_a_flawless_capture_is_the_radiance_at_one_exposure() -> None:
     torch.testing.assert_close(calibrated, directions)
 
 
-def test_ambient_light_is_the_same_in_all_images_of_a_capture() -> None:
+def test_ambient_light_is_the_same_in_all_images_of_a_capture():
     """It is between a share of the pixel's mean and of the capture's mean."""
     radiance, directions = scene()
     config = replace(FLAWLESS, ambient_share=1.0)
@@ -71,7 +71,7 @@ def test_ambient_light_is_the_same_in_all_images_of_a_capture() -> None:
     assert shares.min() > 0 and 10**-3.2 < shares.sum() < 0.1
 
 
-def test_errors_of_calibration_are_those_of_the_capture() -> None:
+def test_errors_of_calibration_are_those_of_the_capture():
     """Every pixel has the same factor under one light."""
     radiance, directions = scene()
     config = replace(FLAWLESS, light_intensity_error_share=1.0, unequal_lights_share=1.0)
@@ -84,7 +84,7 @@ def test_errors_of_calibration_are_those_of_the_capture() -> None:
     assert factors.nanmean(0).std() > 1e-3
 
 
-def test_saturated_captures_are_restored() -> None:
+def test_saturated_captures_are_restored():
     """A matte scene whose brightest observations are clipped comes out as it was, apart from the
     exposure.
     """
@@ -150,9 +150,7 @@ def refining(
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(
-    refining: TrainingConfig, tmp_path: Path
-) -> None:
+def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(refining, tmp_path):
     trainer = Trainer(refining, tmp_path / "run", CPU)
     before = {name: tensor.clone() for name, tensor in trainer.network.state_dict().items()}
     first_deg = trainer.task.validation_deg(trainer.average, bfloat16=False)
@@ -164,9 +162,7 @@ def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_a_second_refinement_net_follows_one_that_is_trained(
-    refining: TrainingConfig, tmp_path: Path
-) -> None:
+def test_a_second_refinement_net_follows_one_that_is_trained(refining, tmp_path):
     Trainer(refining, tmp_path / "first", CPU).run()
     start_from = str(tmp_path / "first" / WEIGHTS)
     twice = replace(
@@ -197,7 +193,7 @@ def test_a_second_refinement_net_follows_one_that_is_trained(
         )
 
 
-def test_the_preset_continues_the_weights_that_it_starts_from() -> None:
+def test_the_preset_continues_the_weights_that_it_starts_from():
     refine = PRESETS["refine"]
     assert resolve_weights(refine.start_from).network.config == refine.network
 
@@ -207,11 +203,11 @@ def network_of(config: TrainingConfig) -> SplineNet:
     return SplineNet(config.network)
 
 
-def test_captures_of_a_pool(refining: TrainingConfig, bumpy_set: PixelSet) -> None:
+def test_captures_of_a_pool(refining, bumpy_set):
     network = network_of(refining)
     scenes = [(bumpy_set, bumpy_set.entries, 1.0)]
 
-    def pool(seed: int) -> ScenePool:
+    def pool(seed):
         made = ScenePool(scenes, network, refining.pixels, seed)
         made.add()
         return made
@@ -249,12 +245,12 @@ def test_a_run_that_continues_has_the_newest_captures(refining, bumpy_set, monke
     assert torch.equal(whole.pool.examples[-1].features, rest.pool.examples[-1].features)
 
 
-def test_generated_pixels_are_no_scenes(refining: TrainingConfig, tmp_path: Path) -> None:
+def test_generated_pixels_are_no_scenes(refining, tmp_path):
     with pytest.raises(UsageError, match="rendered scenes"):
         Trainer(replace(refining, sources={"generator": 1.0}), tmp_path, CPU)
 
 
-def test_the_loss_of_detail_does_not_count_what_turns_all_normals(refining: TrainingConfig) -> None:
+def test_the_loss_of_detail_does_not_count_what_turns_all_normals(refining):
     """A plate in steps, all of it tilted as under wrong lights, or with its steps smoothed. The net
     changes nothing.
     """
@@ -262,10 +258,10 @@ def test_the_loss_of_detail_does_not_count_what_turns_all_normals(refining: Trai
     slopes = torch.zeros(2, 24, 24)
     slopes[0, :, 12:] = 0.5
 
-    def unit_of(slopes: torch.Tensor) -> torch.Tensor:
+    def unit_of(slopes):
         return torch.nn.functional.normalize(torch.cat((-slopes, torch.ones(1, 24, 24))), dim=0)
 
-    def losses_of(estimate: torch.Tensor) -> list[float]:
+    def losses_of(estimate):
         features = torch.zeros(1, CHANNELS, 24, 24)
         features[0, :3] = estimate
         maps = SceneMaps(features, unit_of(slopes)[None], torch.ones(1, 1, 24, 24))
