@@ -186,10 +186,12 @@ class Bench:
         from splinecli.estimate.inference import estimate_normals
         from splinecli.estimate.methods import make_estimator
         from splinecli.lights.draws import draw_lights
+        from splinecli.recipe import RecipeOptions, prepare_capture
 
+        stored = RecipeOptions(as_stored=True)
         source, estimator = open_capture(folder), make_estimator(method)
         for draw in draw_lights(source.light_directions, 10, trials=trials, seed=0):
-            yield estimate_normals(source.read(draw, as_stored=True), estimator)
+            yield estimate_normals(prepare_capture(source, draw, stored), estimator)
 
     def synth_errors(self, capture: str) -> Cells:
         return {

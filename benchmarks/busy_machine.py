@@ -32,7 +32,7 @@ SETTINGS = {
 
 _TIMED = """
 import sys, time
-from splinecli.capture import read_capture
+from splinecli.recipe import read_capture
 from splinecli.inference import estimate_normals
 from splinecli.methods import make_estimator
 

@@ -21,13 +21,15 @@ from scipy.optimize import minimize
 
 from near_lamps import height_field, sphere
 from point_lights import render_point_lights
-from splinecli.capture import Capture, open_capture
+from splinecli.capture import Capture, CaptureWarning, open_capture
+from splinecli.capture.arrays import ArraySource
 from splinecli.capture.sample import Sample
 from splinecli.images.lamps import estimate_light_intensities
-from splinecli.judge.checks import check_arrays, check_capture
+from splinecli.judge.checks import check_capture
 from splinecli.judge.readings import ALL_KINDS, COSTS, POWERS, Kind, Reading, Readings
 from splinecli.lights.draws import draw_lights
 from splinecli.maths.transfer import encode_srgb
+from splinecli.recipe import prepare_capture
 from splinecli.workshop.synthesis.meshes import Mesh
 from splinecli.workshop.synthesis.ray_tracing import Tracer, find_visible_surface
 from splinecli.workshop.synthesis.scenes import (
@@ -104,6 +106,21 @@ def render(index: int) -> Iterator[Rendered]:
         yield Rendered(kind, shape or scene.shape, visible.mask, lights, *images, widths)
 
 
+def warnings_of(capture: Capture, *, intensities: Array | None) -> tuple[CaptureWarning, ...]:
+    """Return the warnings about a capture whose intensities (F,) were measured, or are None."""
+    known = intensities is not None
+    given = np.ones(capture.n_lights) if intensities is None else intensities
+    source = ArraySource(
+        images=[],
+        mask=capture.mask,
+        light_directions=capture.light_directions,
+        light_intensities=given[:, None].repeat(3, axis=1),
+        intensities_known=known,
+        intensities_measured=known,
+    )
+    return check_capture(source, capture).warnings
+
+
 def codes(
     observations: Array, mask: NDArray[np.bool_], lights: Array, *, measured: bool = True
 ) -> list[str]:
@@ -111,7 +128,7 @@ def codes(
         "rendered", observations.astype(np.float32), lights, tuple(range(len(lights))), mask
     )
     intensities = np.ones(len(lights)) if measured else None
-    found = [warning.code for warning in check_arrays(capture, intensities=intensities)]
+    found = [warning.code for warning in warnings_of(capture, intensities=intensities)]
     if not measured and estimate_light_intensities(capture.observations, None, lights) is not None:
         found.append("estimated_intensities")
     return found
@@ -228,10 +245,13 @@ def real(folder: Path, draws: int) -> Iterator[tuple[str, list[str]]]:
             continue
         name = f"{folder.parent.name}/{folder.name}, {count or source.n_lights} lights"
         for draw in draw_lights(source.light_directions, count, trials=draws, seed=SEED):
-            capture = source.read(draw)
+            capture = prepare_capture(source, draw)
             yield (
                 name,
-                [warning.code for warning in (*capture.warnings, *check_capture(source, capture))],
+                [
+                    warning.code
+                    for warning in (*capture.warnings, *check_capture(source, capture).warnings)
+                ],
             )
 
 

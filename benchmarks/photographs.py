@@ -26,6 +26,7 @@ from splinecli.images.lamps import estimate_light_intensities
 from splinecli.images.saturation import restore_saturated
 from splinecli.lights.draws import draw_lights
 from splinecli.maths.normals import angle_between_deg
+from splinecli.recipe import RecipeOptions, prepare_capture
 
 N_LIGHTS = 10
 OVEREXPOSED = 0.2
@@ -45,7 +46,7 @@ class Draw(NamedTuple):
 
 def read_draws(folder: Path, n_draws: int, n_pixels: int) -> list[Draw]:
     source = open_capture(folder)
-    capture = source.read(as_stored=True)
+    capture = prepare_capture(source, options=RecipeOptions(as_stored=True))
     assert capture.ground_truth is not None, f"{folder} has no ground truth"
     normals = capture.ground_truth[capture.mask]
     known = np.flatnonzero(normals.any(axis=1))

@@ -24,6 +24,7 @@ from splinecli.judge.light_order import UNKNOWN_ORDER
 from splinecli.judge.summary import sample_observations
 from splinecli.lights.draws import draw_lights
 from splinecli.lights.light_fit import find_factors
+from splinecli.recipe import RecipeOptions, prepare_capture
 from splinecli.workshop.synthesis.scenes import SceneConfig, draw_scene, render_scene
 
 Array = NDArray[np.floating]
@@ -103,7 +104,10 @@ def real(folders: Sequence[Path], n_lights: int, draws: int) -> Iterator[Lit]:
         source = open_capture(folder)
         # As the check of infer, it sees no intensities that were estimated under the lights in
         # question.
-        capture, known = source.read(as_stored=True), source.intensities_measured
+        capture, known = (
+            prepare_capture(source, options=RecipeOptions(as_stored=True)),
+            source.intensities_measured,
+        )
         wanted = n_lights if n_lights < capture.n_lights else None
         for draw in draw_lights(capture.light_directions, wanted, trials=draws, seed=SEED):
             chosen = list(draw)

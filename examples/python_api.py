@@ -10,10 +10,10 @@ from pathlib import Path
 
 import cv2
 
-from splinecli.capture import read_capture
 from splinecli.estimate.inference import estimate_normals
 from splinecli.estimate.methods import make_estimator
 from splinecli.maths.normals import encode_picture
+from splinecli.recipe import read_capture
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/python_api")
 folder.mkdir(parents=True, exist_ok=True)

@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 import pytest
 
-from splinecli.capture import read_capture
 from splinecli.cli.main import main
 from splinecli.estimate.inference import estimate_normals
 from splinecli.estimate.methods import make_estimator
 from splinecli.maths.normals import angle_between_deg, encode_picture, unit
+from splinecli.recipe import read_capture
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 MEDALLION = EXAMPLES / "medallion"

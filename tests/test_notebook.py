@@ -12,9 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 import splinecli
-from splinecli.capture.reader import capture_from_arrays
+from splinecli.capture.arrays import open_arrays
 from splinecli.cli.main import main
 from splinecli.errors import InputError, UsageError
+from splinecli.recipe import RecipeOptions, prepare_capture
 
 MEDALLION = Path(__file__).resolve().parents[1] / "examples/medallion"
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
@@ -207,9 +208,16 @@ def test_a_mask_of_numbers_obeys_the_rule_of_mask_files(kind):
     images = generator.uniform(0.1, 1, (4, 2, 3))
     directions = [(0.1, 0, 1), (0, 0.4, 1), (-0.5, 0, 1), (0, -0.6, 1)]
     numbers = np.array([[0, 100, 101], [200, 50, 200]], kind)
-    capture = capture_from_arrays(images, directions, numbers, as_stored=True)
+    capture = prepare_capture(
+        open_arrays(images, directions, numbers), options=RecipeOptions(as_stored=True)
+    )
     assert capture.mask.tolist() == [[False, False, True], [True, False, True]]
-    capture = capture_from_arrays(images, directions, numbers > 0, as_stored=True)
+    capture = prepare_capture(
+        open_arrays(images, directions, numbers > 0), options=RecipeOptions(as_stored=True)
+    )
     assert capture.n_pixels == 5
     with pytest.raises(InputError, match="mask"):
-        capture_from_arrays(images, directions, np.zeros((2, 3), kind), as_stored=True)
+        prepare_capture(
+            open_arrays(images, directions, np.zeros((2, 3), kind)),
+            options=RecipeOptions(as_stored=True),
+        )

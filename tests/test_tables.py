@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 import make_tables
 import splinecli
 from html_page import REPORT
+from judged import warnings_of
 from splinecli.capture import Capture
 from splinecli.capture.files import NOT_PHOTOGRAPHS
 from splinecli.cli.main import app
@@ -97,7 +98,7 @@ def test_a_warning_is_a_row(monkeypatch):
         )
 
     monkeypatch.setattr(checks, "CHECKS", [*checks.CHECKS, checks.Check(check)])
-    warnings = checks.check_arrays(capture())
+    warnings = warnings_of(capture())
     assert "uniform" in [warning.code for warning in warnings]
     with pytest.raises(InputError, match="All values are equal"):
         checks.refuse_if_strict(warnings[-1:], "flat", strict=True)

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import ArrayLike, NDArray
 
-    from splinecli.capture.record import LightFinder
     from splinecli.estimate.inference import NormalEstimate
     from splinecli.materials.maps import MaterialMaps
 
@@ -115,28 +114,21 @@ def estimate_normals(
         Zheng et al., SPLINE-Net: sparse photometric stereo through lighting interpolation and
         normal estimation networks, ICCV 2019.
     """
-    from functools import partial
     from warnings import warn
 
-    import numpy as np
-
-    from splinecli.capture.reader import capture_from_arrays
+    from splinecli.capture.arrays import open_arrays
     from splinecli.errors import UsageError
     from splinecli.estimate.methods import MethodOptions, check_method, make_estimator
-    from splinecli.judge.checks import check_arrays
     from splinecli.pipeline.infer import estimate_capture
+    from splinecli.recipe.steps import begin, follow
+    from splinecli.recipe.work import RecipeOptions
 
     check_method(method)
-    find: LightFinder | None = None
     if first_light is not None and light_directions is not None:
         raise UsageError(
             "first_light is for lights that are found", hint="Leave it or light_directions out"
         )
-    if light_directions is None:
-        from splinecli.lights.unknown_lights import find_lights
-
-        find = partial(find_lights, first_light=None if first_light is None else str(first_light))
-    capture = capture_from_arrays(
+    source = open_arrays(
         images,
         light_directions,
         mask,
@@ -144,16 +136,16 @@ def estimate_normals(
         pixel_size=pixel_size,
         camera_matrix=camera_matrix,
         white_level=white_level,
-        as_stored=as_stored,
-        find_lights=find,
     )
+    recipe = RecipeOptions(
+        as_stored=as_stored,
+        finds_lights=light_directions is None,
+        first_light=None if first_light is None else str(first_light),
+    )
+    work = follow(begin(source, options=recipe), last="saturation")
     options = MethodOptions(weights, rotations, batch_size, device, precision)
     estimator = make_estimator(method, options)
-    given = None if light_intensities is None else np.asarray(light_intensities, np.float64)
-    check = partial(check_arrays, intensities=given)
-    estimate, _ = estimate_capture(
-        capture, lambda: estimator, check, distil=distil, progress=progress
-    )
+    estimate, _ = estimate_capture(work, lambda: estimator, distil=distil, progress=progress)
     for warning in estimate.capture.warnings:
         if warning.is_error:
             warn(str(warning), stacklevel=2)

@@ -23,12 +23,11 @@ from splinecli.capture.light_files import read_light_positions
 from splinecli.errors import InputError, UsageError
 from splinecli.estimate.inference import estimate_normals
 from splinecli.estimate.methods import make_estimator
-from splinecli.judge.capture_sample import CaptureSample
-from splinecli.judge.checks import check_sample
-from splinecli.judge.summary import summarise_capture
+from splinecli.judge.checks import check_capture
 from splinecli.lights.calibration.balls import find_ball_files
 from splinecli.maths.normals import angle_between_deg
 from splinecli.maths.transfer import encode_srgb
+from splinecli.recipe import RecipeOptions, prepare_capture
 
 SIZE = 32
 LIGHTS = scenes.spiral_lights(12, 40)
@@ -47,7 +46,7 @@ def folder(tmp_path: Path) -> Path:
 
 def check(source: CaptureSource, mask: np.ndarray | None = DISC) -> list[str]:
     """Compare the normals with the geometry, and return the codes of the warnings."""
-    capture = source.read(as_stored=True)
+    capture = prepare_capture(source, options=RecipeOptions(as_stored=True))
     assert mask is None or (capture.mask == mask).all()
     normals = estimate_normals(capture, make_estimator("ls")).normal_map
     inside = capture.mask & DISC
@@ -116,7 +115,7 @@ def test_images_in_a_folder_of_their_own(folder, listed):
 
 def test_bmp_ground_truth(folder):
     picture(folder / "normals_gt.bmp", np.rint((NORMALS[..., ::-1] + 1) * 127.5).astype(np.uint8))
-    truth = open_capture(folder, mask=None).read().ground_truth
+    truth = prepare_capture(open_capture(folder, mask=None)).ground_truth
     assert truth is not None and angle_between_deg(truth[DISC], NORMALS[DISC]).max() < 1
 
 
@@ -412,12 +411,7 @@ def test_images_of_other_formats(folder, form):
         assert source.facts[0].white_level == 4095
     if form in ("stack", "LZW stack"):
         assert source.files.images[3].name == "stack.tif[3]"
-        assert (
-            check_sample(
-                CaptureSample.of_source(source, summarise_capture(source).samples, range(12))
-            )[1]
-            == []
-        )
+        assert not check_capture(source, prepare_capture(source)).warnings
 
 
 @pytest.mark.parametrize("suffix", [".webp", ".avif", ".heic"])
@@ -430,7 +424,9 @@ def test_display_encoded_formats(folder, suffix):
         options = {"lossless": True} if suffix == ".webp" else {"quality": 100}
         Image.fromarray(np.dstack([image] * 3)).save(folder / f"{number:03}{suffix}", **options)
     picture(folder.parent / "mask.png", MASK)
-    capture = open_capture(folder, mask=folder.parent / "mask.png").read(as_stored=True)
+    capture = prepare_capture(
+        open_capture(folder, mask=folder.parent / "mask.png"), options=RecipeOptions(as_stored=True)
+    )
     assert "display_decoded" in [warning.code for warning in capture.warnings]
     normals = estimate_normals(capture, make_estimator("ls")).normal_map
     # Steps of 8 bits are half a percent of the brightness.
@@ -443,7 +439,7 @@ def test_formats_that_need_an_extra_or_are_not_read(folder, monkeypatch):
         path.with_suffix(".heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0" + bytes(64))
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     with pytest.raises(InputError, match=r"000\.heic: .*pip install 'splinecli\[heif\]'"):
-        open_capture(folder).read()
+        prepare_capture(open_capture(folder))
     for path in folder.glob("*.heic"):
         path.rename(path.with_suffix(".jxl"))
     with pytest.raises(InputError, match=r"contains no images, but 12 \.jxl files\. PNG,"):

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from splinecli.capture import open_capture, read_capture
+from splinecli.capture import open_capture
 from splinecli.errors import InputError
+from splinecli.recipe import prepare_capture, read_capture
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.6, 0, 0.8]])
 
@@ -87,4 +88,4 @@ def test_an_image_that_vanishes(folder):
     source = open_capture(folder)
     (folder / "3.tif").unlink()
     with pytest.raises(InputError, match=r"3\.tif: the file (does not exist|cannot be read)"):
-        source.read()
+        prepare_capture(source)

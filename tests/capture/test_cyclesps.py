@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from splinecli.capture import capture_name, find_captures, open_capture, read_capture
+from splinecli.capture import capture_name, find_captures, open_capture
 from splinecli.errors import InputError
+from splinecli.recipe import read_capture
 
 HEIGHT, WIDTH = 7, 11  # unequal, so that nothing is turned round unnoticed
 LIGHTS = np.array(

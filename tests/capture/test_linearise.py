@@ -10,10 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 from scenes import with_chunk, write_capture
-from splinecli.capture import CaptureWarning, RadiometricCalibration, open_capture, read_capture
+from splinecli.capture import CaptureWarning, RadiometricCalibration, open_capture
 from splinecli.capture.formats.facts import read_header
 from splinecli.capture.linearise import linear_light
 from splinecli.errors import InputError
+from splinecli.recipe import prepare_capture, read_capture
 
 LIGHTS = np.array([(0, 0, 1), (0.5, 0, 1), (0, 0.5, 1), (-0.5, 0, 1)])
 
@@ -44,7 +45,9 @@ def codes(warnings: Iterable[CaptureWarning]) -> list[str]:
 
 
 def observed(folder: Path, **settings: Any) -> NDArray[np.float32]:
-    return open_capture(folder, radiometry=RadiometricCalibration(**settings)).read().observations
+    return prepare_capture(
+        open_capture(folder, radiometry=RadiometricCalibration(**settings))
+    ).observations
 
 
 def expected(light: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -70,7 +73,9 @@ def test_ambient_light_is_taken_off(tmp_path, light, gamma, found):
     folder = store(tmp_path / "capture", encode(light + ambient))
     path = write((folder if found else tmp_path) / "Ambient.png", encode(ambient))
     settings = {} if found else {"ambient": path}
-    capture = open_capture(folder, radiometry=RadiometricCalibration(gamma, **settings)).read()
+    capture = prepare_capture(
+        open_capture(folder, radiometry=RadiometricCalibration(gamma, **settings))
+    )
     np.testing.assert_allclose(capture.observations, expected(light), atol=6e-5)
     assert ("ambient_subtracted" in codes(capture.warnings)) == found
 

@@ -19,6 +19,7 @@ from splinecli.maths.pixel_grid import pixel_rays
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions, InfoOptions
 from splinecli.pipeline.info import describe_capture
+from splinecli.recipe import RecipeOptions, prepare_capture
 
 MEDALLION = Path(__file__).parents[2] / "examples/medallion"
 WINDOWS = [("31,22,50,47", None), (None, "1/3"), ("31,22,50,47", "1/4")]
@@ -34,8 +35,10 @@ def on_image(mask: NDArray[np.bool_], values: NDArray[Any]) -> NDArray[Any]:
 @pytest.mark.parametrize(("crop", "scale"), WINDOWS)
 def test_a_window_reads_a_part_of_the_whole(crop: str | None, scale: str | None) -> None:
     window = parse_window(crop, scale)
-    whole = open_capture(MEDALLION).read(as_stored=True)
-    part = open_capture(MEDALLION, window=window).read(as_stored=True)
+    whole = prepare_capture(open_capture(MEDALLION), options=RecipeOptions(as_stored=True))
+    part = prepare_capture(
+        open_capture(MEDALLION, window=window), options=RecipeOptions(as_stored=True)
+    )
     np.testing.assert_array_equal(part.mask, window.of(whole.mask))
     np.testing.assert_array_equal(part.ground_truth, window.of(whole.ground_truth))
     # Sums over the colours may round differently.
@@ -60,7 +63,7 @@ def test_ambient_and_flat_field_are_read_in_the_window(tmp_path: Path) -> None:
     maps = []
     for crop, scale in ((None, None), WINDOWS[2]):
         options = InferOptions(method="ls", crop=crop, scale=scale, flat_field=str(flats))
-        capture = options.open(folder).read(as_stored=True)
+        capture = prepare_capture(options.open(folder), options=RecipeOptions(as_stored=True))
         maps.append(on_image(capture.mask, capture.observations))
     part = parse_window(*WINDOWS[2]).of(maps[0])
     # The flat field is divided by its mean over the pixels that are read.
@@ -116,7 +119,7 @@ def test_windows_that_do_not_fit_are_refused() -> None:
     with pytest.raises(InputError, match="--crop 0,0,5000,5 is not inside the image of"):
         open_capture(MEDALLION, window=parse_window("0,0,5000,5", None))
     with pytest.raises(InputError, match="no pixel in the part that is read"):
-        open_capture(MEDALLION, window=parse_window("0,0,3,3", None)).read()
+        prepare_capture(open_capture(MEDALLION, window=parse_window("0,0,3,3", None)))
 
 
 @pytest.mark.parametrize(("crop", "scale"), WINDOWS)
@@ -130,7 +133,7 @@ def test_a_part_is_lit_and_seen_as_in_the_whole(crop, scale, near, perspective, 
     for options in ((None, None), (crop, scale)):
         camera = str(matrix) if perspective else None
         record = InferOptions(crop=options[0], scale=options[1], camera_matrix=camera, **lamps)
-        capture = record.open(MEDALLION).read(as_stored=True)
+        capture = prepare_capture(record.open(MEDALLION), options=RecipeOptions(as_stored=True))
         lit = lighting_on(capture)(None, np.arange(capture.n_pixels)) if not near else None
         if near:
             places = [places.astype(np.float64) for places in np.nonzero(capture.mask)]
@@ -151,10 +154,10 @@ def test_the_width_of_a_part_is_not_that_of_the_object() -> None:
     options = InferOptions(crop="31,22,50,47", light_distance=400.0, object_width=10.0)
     with pytest.raises(SplinecliError, match="--object-width needs the whole object in the image"):
         options.open(MEDALLION)
-    narrow = (
-        InferOptions(scale="1/3", light_distance=400.0, object_width=10.0).open(MEDALLION).read()
+    narrow = prepare_capture(
+        InferOptions(scale="1/3", light_distance=400.0, object_width=10.0).open(MEDALLION)
     )
-    wide = InferOptions(light_distance=400.0, object_width=10.0).open(MEDALLION).read()
+    wide = prepare_capture(InferOptions(light_distance=400.0, object_width=10.0).open(MEDALLION))
     assert narrow.lamps.pixel_size == pytest.approx(3 * wide.lamps.pixel_size, rel=0.03)
 
 

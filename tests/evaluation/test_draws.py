@@ -2,6 +2,7 @@
 each draw.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,9 @@ from splinecli.evaluation.run import evaluate_all
 from splinecli.evaluation.trials import TrialStore
 from splinecli.lights.draws import draw_lights
 from splinecli.maths.normals import unit
+from splinecli.recipe import prepare_capture
+from splinecli.recipe.steps import begin, follow
+from splinecli.recipe.work import RecipeOptions, Work
 from splinecli.records.white_level import WhiteLevel
 
 
@@ -148,12 +152,14 @@ def folder(tmp_path: Path) -> Path:
 
 def mae_deg(folder: Path, lights: tuple[int, ...], **settings: bool) -> float:
     """The error of a capture under these lights, read without any other image."""
-    return estimate_normals(open_capture(folder).read(lights, **settings), LS).errors.mean
+    return estimate_normals(
+        prepare_capture(open_capture(folder), lights, RecipeOptions(**settings)), LS
+    ).errors.mean
 
 
 def test_each_trial_scores_what_infer_computes_from_its_lights(folder):
     draws = draw_lights(open_capture(folder).light_directions, 5, trials=12, seed=1)
-    levels = {draw: open_capture(folder).read(draw).white_level for draw in draws}
+    levels = {draw: prepare_capture(open_capture(folder), draw).white_level for draw in draws}
     assert set(levels.values()) == {WhiteLevel(LEVEL, "images"), WhiteLevel(65_535, "full scale")}
     (result,) = evaluate([folder], [LS], Protocol(5, trials=12, seed=1)).results
     assert result.maes_deg == pytest.approx([mae_deg(folder, draw) for draw in draws], abs=1e-6)
@@ -172,17 +178,21 @@ def test_the_number_of_trials_does_not_change_a_trial(folder, max_pixels):
     assert few == pytest.approx(maes_deg(12, TrialStore()), abs=1e-6)
 
 
+def observed(folder: Path, lights: Sequence[int] | None = None) -> Work:
+    return follow(begin(open_capture(folder), lights), last="observations")
+
+
 def test_a_part_of_the_images_and_pixels_keeps_the_level_of_its_images(folder):
-    stored = open_capture(folder).read_stored()
-    assert stored.capture.white_level == WhiteLevel(LEVEL, "images")
-    dim = stored.choose_lights([1, 4, 5, 6, 8])
-    assert (dim.capture.white_level, dim.saturation.flags) == (
+    stored = observed(folder)
+    assert stored.made.white_level == WhiteLevel(LEVEL, "images")
+    dim = stored.choose_images([1, 4, 5, 6, 8])
+    assert (dim.made.white_level, dim.saturated.flags) == (
         WhiteLevel(65_535, "full scale"),
         None,
     )
     rows = np.arange(0, SIDE * SIDE, 7)
-    bright = stored.choose_lights([2, 4, 0, 1]).choose_pixels(rows).choose_pixels(np.arange(5, 300))
-    alone = open_capture(folder).read_stored([2, 4, 0, 1])
-    assert bright.capture.white_level == alone.capture.white_level == WhiteLevel(LEVEL, "images")
-    assert bright.saturation.flags.any()
-    np.testing.assert_array_equal(bright.saturation.flags, alone.saturation.flags[rows][5:300])
+    bright = stored.choose_images([2, 4, 0, 1]).choose_pixels(rows).choose_pixels(np.arange(5, 300))
+    alone = observed(folder, [2, 4, 0, 1])
+    assert bright.made.white_level == alone.made.white_level == WhiteLevel(LEVEL, "images")
+    assert bright.saturated.flags.any()
+    np.testing.assert_array_equal(bright.saturated.flags, alone.saturated.flags[rows][5:300])

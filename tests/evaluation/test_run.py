@@ -13,13 +13,13 @@ import pytest
 from numpy.typing import NDArray
 
 from scenes import evaluate
-from splinecli.capture import read_capture
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.estimate.methods import Estimator, make_estimator
 from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.run import evaluate_all
 from splinecli.evaluation.trials import TrialStore
 from splinecli.maths.normals import unit
+from splinecli.recipe import read_capture
 
 WriteDome = Callable[..., Path]
 

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from splinecli.capture import Capture
-from splinecli.capture.record import StoredCapture
 from splinecli.evaluation.trials import scored_rows, tilt_lights
-from splinecli.images.saturation import Saturation
 from splinecli.maths.normals import angle_between_deg, unit
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
@@ -32,11 +30,7 @@ def test_pixels_without_ground_truth_go(capture: Capture) -> None:
     wanted[:, 3:5] = False
     rows = scored_rows(capture)
     np.testing.assert_array_equal(capture.observations[rows, 0], np.flatnonzero(wanted))
-    kept = (
-        StoredCapture(capture, Saturation(capture.n_pixels, ()), intensities_known=True)
-        .choose_pixels(rows)
-        .capture
-    )
+    kept = capture.choose_pixels(rows)
     np.testing.assert_array_equal(kept.mask, wanted)
     np.testing.assert_array_equal(kept.observations[:, 0], np.flatnonzero(wanted))
     assert kept.light_indices == (4, 7, 9)

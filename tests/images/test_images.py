@@ -23,6 +23,7 @@ from splinecli.images.saturation import (
     restore_saturated,
 )
 from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.recipe import RecipeOptions, prepare_capture
 from splinecli.records.white_level import WhiteLevel
 
 SIDE = 60
@@ -169,7 +170,7 @@ def test_a_given_level_is_used_as_it_is():
 
 
 def ls_error_deg(folder: Path, normals: NDArray[np.float64], **settings: float) -> float:
-    capture = open_capture(folder, **settings).read()
+    capture = prepare_capture(open_capture(folder, **settings))
     solution = np.linalg.lstsq(LIGHTS, capture.observations.T.astype(np.float64), rcond=None)[0]
     return float(angle_between_deg(unit(solution.T), normals.reshape(-1, 3)).mean())
 
@@ -177,10 +178,10 @@ def ls_error_deg(folder: Path, normals: NDArray[np.float64], **settings: float) 
 def test_12_bit_images_are_restored_like_16_bit_ones(tmp_path):
     images, normals = sphere()
     folder = write_capture(tmp_path / "vase", clip(images, 4095), LIGHTS)
-    capture = open_capture(folder).read()
+    capture = prepare_capture(open_capture(folder))
     assert capture.white_level == WhiteLevel(4095, "images")
     assert {"white_level", "saturated"} <= {warning.code for warning in capture.warnings}
-    stored = open_capture(folder).read(as_stored=True)
+    stored = prepare_capture(open_capture(folder), options=RecipeOptions(as_stored=True))
     assert stored.restored is None
     assert stored.white_level == capture.white_level
     assert (capture.observations > stored.observations)[~capture.restored].sum() == 0
@@ -204,12 +205,12 @@ def test_png_states_its_bits(tmp_path, bits, level):
     folder = write_capture(tmp_path / "vase", images, LIGHTS)
     for path in folder.glob("*.png"):
         path.write_bytes(with_chunk(path.read_bytes(), b"sBIT", bytes(bits)))
-    assert open_capture(folder).read().white_level == (
+    assert prepare_capture(open_capture(folder)).white_level == (
         WhiteLevel(level, "file") if level else FULL_SCALE
     )
     # not all of them
     (folder / "011.png").write_bytes(cv2.imencode(".png", images[11])[1].tobytes())
-    assert open_capture(folder).read().white_level == FULL_SCALE
+    assert prepare_capture(open_capture(folder)).white_level == FULL_SCALE
 
 
 @pytest.mark.parametrize(
@@ -222,7 +223,7 @@ def test_tiff_states_its_level(tmp_path, tag, value, level):
     for number, image in enumerate(bright(100)):
         tifffile.imwrite(folder / f"{number}.tif", image, extratags=[(tag, "H", 1, value, True)])
     np.savetxt(folder / "lights.txt", LIGHTS)
-    assert open_capture(folder).read().white_level == (
+    assert prepare_capture(open_capture(folder)).white_level == (
         WhiteLevel(level, "file") if level else FULL_SCALE
     )
 
@@ -254,7 +255,7 @@ def test_tiff_of_12_bits_a_sample(tmp_path):
     for number, image in enumerate(images):
         write_12_bit_tiff(tmp_path / f"{number}.tif", image)
     np.savetxt(tmp_path / "lights.txt", LIGHTS)
-    capture = open_capture(tmp_path).read()
+    capture = prepare_capture(open_capture(tmp_path))
     assert capture.white_level.origin == "file"
     assert capture.restored is not None
     assert np.count_nonzero(capture.restored) <= np.count_nonzero(images == 4095)

@@ -9,12 +9,14 @@ import pytest
 from numpy.typing import NDArray
 
 from scenes import shade, sphere, sphere_cap, spiral_lights, write_capture
+from splinecli.capture.arrays import open_arrays
 from splinecli.capture.near_lamps import NearLamps
-from splinecli.capture.reader import capture_from_arrays, open_capture
+from splinecli.capture.reader import open_capture
 from splinecli.images.lamps import estimate_light_intensities
 from splinecli.lights.draws import draw_lights
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.robust import fit_scaled_normals
+from splinecli.recipe import RecipeOptions, prepare_capture
 from splinecli.results.map_values import albedo_map
 
 LIGHTS = spiral_lights(10, 50, 15)
@@ -56,10 +58,10 @@ def test_colours_are_divided_out(tmp_path) -> None:
     images, normals, mask = striped(SOFT)
     folder = write_capture(tmp_path, images, LIGHTS, mask=mask, intensities=np.ones((10, 3)))
     source = open_capture(folder)
-    capture = source.read()
+    capture = prepare_capture(source)
     for untouched in (
-        source.read(as_stored=True),
-        open_capture(folder, intensities="equal").read(),
+        prepare_capture(source, options=RecipeOptions(as_stored=True)),
+        prepare_capture(open_capture(folder, intensities="equal")),
     ):
         assert untouched.estimated_colours is None
         assert "estimated_colours" not in [warning.code for warning in untouched.warnings]
@@ -79,14 +81,15 @@ def test_colours_are_divided_out(tmp_path) -> None:
     red = albedo / albedo.sum(axis=1, keepdims=True)
     stripe = np.nonzero(mask)[1] // 4 % 4 == 0
     assert np.std(red[stripe][:, 0]) < 0.03
-    from_arrays = capture_from_arrays(images, LIGHTS, mask, light_intensities=np.ones(10))
+    from_arrays = prepare_capture(open_arrays(images, LIGHTS, mask, light_intensities=np.ones(10)))
     np.testing.assert_allclose(from_arrays.observations, capture.observations, rtol=1e-4, atol=1e-5)
 
 
 def test_pure_colours_are_named() -> None:
     images, _, mask = striped(PURE)
     codes = {
-        warning.code: warning for warning in capture_from_arrays(images, LIGHTS, mask).warnings
+        warning.code: warning
+        for warning in prepare_capture(open_arrays(images, LIGHTS, mask)).warnings
     }
     assert "light_colours" in codes and codes["light_colours"].error_deg
 
@@ -95,7 +98,7 @@ def test_a_gray_object_needs_no_colours() -> None:
     normals, mask = sphere(48, 0.9)
     shaded = np.where(mask[..., None], shade(normals, LIGHTS), 0)
     images = np.rint(np.einsum("hwf,fc->fhwc", shaded, PURE) * 40_000).astype(np.uint16)
-    capture = capture_from_arrays(images, LIGHTS, mask, light_intensities=np.ones(10))
+    capture = prepare_capture(open_arrays(images, LIGHTS, mask, light_intensities=np.ones(10)))
     assert not {"light_colours", "estimated_colours"} & {
         warning.code for warning in capture.warnings
     }
@@ -105,7 +108,7 @@ def test_a_gray_object_needs_no_colours() -> None:
 def test_white_lamps_are_left_alone(change: float) -> None:
     colours = 1 + change * np.random.default_rng(1).normal(size=(10, 3))
     images, _, mask = striped(colours)
-    assert capture_from_arrays(images, LIGHTS, mask).estimated_colours is None
+    assert prepare_capture(open_arrays(images, LIGHTS, mask)).estimated_colours is None
 
 
 INTENSITIES = np.array([0.5, 1.0, 1.6, 0.8, 1.2, 0.7, 1.4, 0.9])
@@ -214,7 +217,10 @@ def test_a_capture_without_a_file_of_intensities(tmp_path):
     shaded = np.moveaxis(shade(sphere_cap(40, 0.6), directions) * INTENSITIES, 2, 0)
     write_capture(tmp_path, np.rint(30_000 * shaded).astype(np.uint16), directions)
     source = open_capture(tmp_path)
-    plain, restored = source.read(as_stored=True), source.read()
+    plain, restored = (
+        prepare_capture(source, options=RecipeOptions(as_stored=True)),
+        prepare_capture(source),
+    )
     assert plain.estimated_intensities is None
     low, high = INTENSITIES.min() / INTENSITIES.mean(), INTENSITIES.max() / INTENSITIES.mean()
     (warning,) = (
@@ -234,16 +240,18 @@ def test_a_capture_without_a_file_of_intensities(tmp_path):
     )
     # Given intensities replace estimates.
     np.savetxt(tmp_path / "light_intensities.txt", np.ones((8, 3)))
-    assert open_capture(tmp_path).read().estimated_intensities is None
+    assert prepare_capture(open_capture(tmp_path)).estimated_intensities is None
     (tmp_path / "light_intensities.txt").unlink()
-    assert open_capture(tmp_path, intensities="equal").read().estimated_intensities is None
+    assert (
+        prepare_capture(open_capture(tmp_path, intensities="equal")).estimated_intensities is None
+    )
 
 
 @pytest.mark.parametrize("name", ["ballPNG", "catPNG"])
 def test_real_objects_whose_lights_were_measured(shared_data, name):
     """Ten of DiLiGenT's lights, of which the strongest is four to six times the weakest."""
     source = open_capture(shared_data / "DiLiGenT/pmsData" / name)
-    capture = source.read()
+    capture = prepare_capture(source)
     measured = source.light_intensities.mean(axis=1)
     for chosen in draw_lights(capture.light_directions, 10, trials=3, seed=0):
         order, directions = list(chosen), capture.light_directions[list(chosen)]

@@ -8,8 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from scenes import shade, sphere_cap, spiral_lights
-from splinecli.capture.reader import capture_from_arrays
+from splinecli.capture.arrays import open_arrays
 from splinecli.images.lens_blur import NOISE, REACH, inverse_filter, remove_blur, surroundings
+from splinecli.recipe import RecipeOptions, prepare_capture
 
 Images = NDArray[np.float32]
 SIDE, FINER = 96, 4
@@ -124,7 +125,7 @@ def test_values_outside_the_mask_may_be_no_light():
     lights = np.array([(np.cos(angle), np.sin(angle), 1.5) for angle in np.linspace(0, 5, 8)])
     images[3, ~mask] = np.nan
     images[4, ~mask] = -1
-    capture = capture_from_arrays(images, lights, mask, light_intensities=np.ones(8))
+    capture = prepare_capture(open_arrays(images, lights, mask, light_intensities=np.ones(8)))
     assert capture.observations.shape == (mask.sum(), 8)
     assert np.isfinite(capture.observations).all() and capture.observations.min() >= 0
 
@@ -132,10 +133,13 @@ def test_values_outside_the_mask_may_be_no_light():
 def test_stored_values_stay_as_they_are():
     images = blurred(discs(), 0.7)
     lights = np.array([(np.cos(angle), np.sin(angle), 1.5) for angle in np.linspace(0, 5, 8)])
-    capture = capture_from_arrays(images, lights, light_intensities=np.ones(8), as_stored=True)
+    capture = prepare_capture(
+        open_arrays(images, lights, light_intensities=np.ones(8)),
+        options=RecipeOptions(as_stored=True),
+    )
     assert capture.removed_blur is None
     np.testing.assert_allclose(capture.observations, images.reshape(8, -1).T, rtol=1e-5)
-    sharpened = capture_from_arrays(images, lights, light_intensities=np.ones(8))
+    sharpened = prepare_capture(open_arrays(images, lights, light_intensities=np.ones(8)))
     np.testing.assert_allclose(
         sharpened.observations.T.reshape(images.shape), removed(images)[0], atol=1e-4
     )

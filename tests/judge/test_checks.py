@@ -5,12 +5,14 @@ intensities.
 import numpy as np
 import pytest
 
+from judged import warnings_of
 from scenes import cap_directions, directions_at, halfway, ring_lights, shade, spiral_lights
 from splinecli.capture import Capture
-from splinecli.capture.reader import capture_from_arrays
+from splinecli.capture.arrays import open_arrays
 from splinecli.capture.sample import Sample
-from splinecli.judge.checks import check_arrays, light_spread, repeated_images
+from splinecli.judge.checks import light_spread, repeated_images
 from splinecli.judge.summary import CLOSEUP_SIDE, closeup_of, leave_out_background
+from splinecli.recipe import prepare_capture
 
 
 def test_the_same_image_twice() -> None:
@@ -48,7 +50,7 @@ def codes(intensities: np.ndarray) -> list[str]:
     ) * intensities
     values = (shaded + rng.normal(0, 0.003, shaded.shape)).clip(0).astype(np.float32)
     capture = Capture("glossy", values, lights, tuple(range(12)), np.ones((30, 30), np.bool_))
-    return [warning.code for warning in check_arrays(capture)]
+    return [warning.code for warning in warnings_of(capture)]
 
 
 def test_unequal_intensities_that_cannot_be_estimated_are_named() -> None:
@@ -100,10 +102,10 @@ def test_a_dark_background_is_left_out():
 def test_wrong_lights_are_named_without_a_mask(masked):
     images, lights, mask = ball_before(0.01)
     for signs, expected in (((-1, 1, 1), ["light_frame"]), ((1, 1, 1), [])):
-        capture = capture_from_arrays(
-            images, lights * signs, mask if masked else np.ones_like(mask)
+        capture = prepare_capture(
+            open_arrays(images, lights * signs, mask if masked else np.ones_like(mask))
         )
         codes = [
-            warning.code for warning in check_arrays(capture, intensities=np.ones(capture.n_lights))
+            warning.code for warning in warnings_of(capture, intensities=np.ones(capture.n_lights))
         ]
         assert codes == expected + ([] if masked else ["no_mask"])

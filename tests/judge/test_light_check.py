@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 import scenes
 from scenes import ring_lights, spiral_lights
-from splinecli.capture import read_capture
 from splinecli.capture.light_rows import PLANE_FRAMES, LightFrame, parse_light_frame
 from splinecli.errors import UsageError
 from splinecli.judge.light_check import LightCheck, check_lights
 from splinecli.judge.light_order import UNKNOWN_ORDER
 from splinecli.lights.light_fit import find_factors, random_misfits
 from splinecli.maths.normals import unit
+from splinecli.recipe import read_capture
 
 Array = NDArray[np.float64]
 SIZE = 64

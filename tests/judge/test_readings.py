@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from judged import warnings_of
 from scenes import ring_lights, shade, spiral_lights, square_grid
 from scenes import sphere as ball
 from splinecli.capture import Capture
 from splinecli.capture.near_lamps import NearLamps
-from splinecli.judge.checks import check_arrays
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.records.capture_warnings import CaptureWarning
 
@@ -72,7 +72,7 @@ def found(
     capture = Capture("scene", observed.astype(np.float32), lights, tuple(range(len(lights))), mask)
     return [
         warning
-        for warning in check_arrays(capture, intensities=intensities)
+        for warning in warnings_of(capture, intensities=intensities)
         if warning.code in CODES
     ]
 
@@ -176,7 +176,7 @@ def test_too_little_is_not_judged() -> None:
             tuple(range(10)),
             np.ones(shape, np.bool_),
         )
-        assert not CODES & {warning.code for warning in check_arrays(capture)}
+        assert not CODES & {warning.code for warning in warnings_of(capture)}
 
 
 def test_clipped_values_are_no_curve() -> None:

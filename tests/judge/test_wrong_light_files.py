@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 import scenes
+from judged import warnings_of
 from scenes import directions_at, halfway, ring_lights, spiral_lights, square_grid
 from splinecli.capture import Capture
-from splinecli.judge.checks import check_arrays
 from splinecli.judge.light_check import LightCheck, check_lights
 from splinecli.judge.light_order import HALF_VECTORS
 from splinecli.lights.rough_normals import cast_shadows
@@ -184,7 +184,7 @@ def test_warnings_state_the_error_of_the_normals(fault: str) -> None:
     capture = Capture(
         "ball", shade(normals, TWO_RINGS).astype(np.float32), given, np.arange(10), mask
     )
-    warnings = check_arrays(capture, intensities=np.ones(len(capture.light_directions)))
+    warnings = warnings_of(capture, intensities=np.ones(len(capture.light_directions)))
     stated = [warning.error_deg for warning in warnings if warning.kind == code]
     assert stated and min(error or 0 for error in stated) > 10
 
@@ -196,7 +196,7 @@ def test_a_wrong_image_states_the_error_that_it_makes(kind: kinds.WarningKind) -
     normals, mask = ball()
     observations = shade(normals, TWO_RINGS).astype(np.float32)
     observations[:, 3] = observations[:, 7] if kind == kinds.REPEATED_IMAGES else 0
-    warnings = check_arrays(
+    warnings = warnings_of(
         Capture("ball", observations, TWO_RINGS, np.arange(10), mask), intensities=np.ones(10)
     )
     assert warnings[0].kind == kind and warnings[0].error_deg is not None

@@ -28,6 +28,7 @@ from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.integrate import integrate_normal_map
 from splinecli.pipeline.options import EvaluateOptions, IntegrateOptions
+from splinecli.recipe import prepare_capture
 from splinecli.records.output_files import MAPS
 from splinecli.results.maps import make_map, map_files
 from splinecli.results.material import material_facts, material_warnings
@@ -256,7 +257,7 @@ def test_coloured_lamps_do_not_tint_gray_images(glossy, tmp_path):
 
 
 def test_colours_of_another_shape_are_refused(glossy):
-    estimate = estimate_normals(open_capture(glossy).read(), make_estimator("ls"))
+    estimate = estimate_normals(prepare_capture(open_capture(glossy)), make_estimator("ls"))
     colours = np.full((len(LIGHTS), SIZE, SIZE, 3), np.float32(0.5))
     for wrong in (colours[..., 0], colours[1:], colours[:, 1:], "images"):
         with pytest.raises(UsageError, match=r"expected numbers of shape \(12, 48, 48, 3\)"):
@@ -313,7 +314,7 @@ def test_a_rendered_scene(tmp_path):
 def test_colours_are_read_once_more(glossy):
     source = open_capture(glossy)
     steps = []
-    estimate = estimate_normals(source.read(), make_estimator("ls"))
+    estimate = estimate_normals(prepare_capture(source), make_estimator("ls"))
     assert make_map(MAPS["material"], source, estimate, lambda: steps.append(1)) is not None
     assert len(steps) == len(LIGHTS)
 
@@ -359,7 +360,7 @@ def test_relighting_needs_lights_that_are_left(glossy, tmp_path):
 
 def test_unequal_white_balance_changes_the_base_colour_alone(glossy):
     """The gains of a camera's channels are not known, so they tint the base colour."""
-    estimate = estimate_normals(open_capture(glossy).read(), make_estimator("ls"))
+    estimate = estimate_normals(prepare_capture(open_capture(glossy)), make_estimator("ls"))
     images = np.zeros((len(LIGHTS), SIZE, SIZE, 3), np.float32)
     images[:, MASK] = estimate.capture.observations.T[..., None]
     gains = np.array((1.5, 1, 0.5), np.float32)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
 from scenes import with_chunk
-from splinecli.capture import open_capture, read_capture
+from splinecli.capture import open_capture
 from splinecli.capture.formats.facts import StatedCurve, read_header
 from splinecli.errors import UsageError
 from splinecli.maths.transfer import (
@@ -26,6 +26,7 @@ from splinecli.maths.transfer import (
     parse_transfer,
     profile_curve,
 )
+from splinecli.recipe import read_capture
 
 SRGB_PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 STORED = np.linspace(0, 1, 1001).astype(np.float32)

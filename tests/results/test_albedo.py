@@ -12,6 +12,7 @@ from scenes import square_grid, write_capture
 from splinecli.capture import open_capture
 from splinecli.lights.calibration.balls import find_ball_files
 from splinecli.lights.calibration.lamps import measure_light_intensities
+from splinecli.recipe import RecipeOptions, prepare_capture
 from splinecli.results.map_values import albedo_map
 
 SIZE = 40
@@ -61,7 +62,7 @@ def test_a_gray_target_balances_the_colours(scene, tmp_path):
     measured = measure_light_intensities(find_ball_files(tmp_path / "card"), LIGHTS, "card")
     np.savetxt(folder / "light_intensities.txt", measured)
     source = open_capture(folder)
-    found = albedo_map(source, source.read(), normals)[normals.any(axis=2)]
+    found = albedo_map(source, prepare_capture(source), normals)[normals.any(axis=2)]
     seen = found[found[:, 0] > 0]
     np.testing.assert_allclose(seen / seen[:, :1], 1, atol=0.01)
     assert seen.std() / seen.mean() < 0.02
@@ -76,8 +77,8 @@ def test_restored_pixels_do_not_spoil_it(scene):
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.int64)
         cv2.imwrite(str(path), np.minimum(2.5 * picture, 65_535).astype(np.uint16))
     source = open_capture(folder)
-    capture = source.read()
-    stored = source.read(as_stored=True).observations
+    capture = prepare_capture(source)
+    stored = prepare_capture(source, options=RecipeOptions(as_stored=True)).observations
     inside = normals.any(axis=2)
     found = albedo_map(source, capture, normals)[inside] / (2.5 * albedo[inside])
     touched = (capture.observations > stored).any(axis=1)
@@ -91,7 +92,7 @@ def test_albedo_in_colour(scene):
     folder, normals, albedo = scene
     source = open_capture(folder)
     steps = []
-    found = albedo_map(source, source.read(), normals, progress=lambda: steps.append(1))
+    found = albedo_map(source, prepare_capture(source), normals, progress=lambda: steps.append(1))
     assert len(steps) == 6
     assert (found.dtype, found.shape) == (np.float32, (SIZE, SIZE, 3))
     inside = normals.any(axis=2)
@@ -101,11 +102,11 @@ def test_albedo_in_colour(scene):
     assert np.median(error) < 1e-3
     assert np.quantile(error, 0.99) < 0.12
     # The plain mean over the lights is wrong here, so the choice of observations matters.
-    capture = source.read()
+    capture = prepare_capture(source)
     plain = (capture.observations / (normals[inside] @ capture.light_directions.T).clip(0.15)).mean(
         axis=1
     )
     assert np.quantile(np.abs(plain / albedo[inside].mean(axis=1) - 1), 0.9) > 0.2
     # Where no light reaches the surface, it is black.
-    turned = albedo_map(source, source.read(), (normals * (1, 1, -1)).astype(np.float32))
+    turned = albedo_map(source, prepare_capture(source), (normals * (1, 1, -1)).astype(np.float32))
     assert not turned[normals[..., 2] > 0.95].any()

@@ -5,10 +5,10 @@ by files and arrays."""
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 from splinecli.capture.formats.facts import ImageHeader
 from splinecli.capture.formats.images import ExpectedSize, decode_image, to_linear
 from splinecli.errors import InputError, UsageError
-from splinecli.images.lamps import COLOUR_SAMPLE, lamp_colours
-from splinecli.images.lens_blur import remove_blur
-from splinecli.images.saturation import ImageValues, Saturation, look_at, white_level_warnings
+from splinecli.images.saturation import ImageValues, look_at
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Floats, Integers
 from splinecli.maths.transfer import BT709, TransferCurve, decode_transfer
 from splinecli.records import capture_warnings as codes
@@ -309,114 +307,3 @@ class StoredPixels:
         colours = np.array(np.broadcast_to(self.linear, (len(self.linear), 3)), np.float32)
         colours /= self.intensity.astype(np.float32)
         return colours
-
-
-class Observed(NamedTuple):
-    """What read_observations returns."""
-
-    observations: Float32Array  # (P, F)
-    saturation: Saturation
-    warnings: list[CaptureWarning]
-    # (F, 3), of the lamps, which are divided out; None if they do not differ
-    colours: Float64Array | None
-    blur: float | None  # the standard deviation in pixels of the blur that was removed
-
-
-def collect_observations(
-    images: Iterable[StoredPixels],
-    n_pixels: int,
-    n_images: int,
-    white_level: float | None,
-    n_around: int = 0,
-) -> tuple[Float32Array, Saturation, list[CaptureWarning], Float64Array | None]:
-    """Return observations (P + R, F) of the images in their order, which are saturated, warnings,
-    and colours of lamps.
-
-    The last R observations are of pixels around the mask. Everything else concerns the mask alone.
-
-    The colours (F, 3) are None unless they differ from image to image; see lamp_colours. They are
-    not divided out.
-
-    Only one image is in memory at a time. The white level is given by the user, or None to find it.
-    Raises InputError if it is above an image's full scale.
-    """
-    observations = np.empty((n_pixels + n_around, n_images), np.float32)
-    any_8_bit, found, colours = False, list[ImageValues](), list[Float32Array]()
-    compared = np.linspace(0, n_pixels - 1, min(n_pixels, COLOUR_SAMPLE)).astype(np.intp)
-    for position, image in enumerate(images):
-        any_8_bit |= image.values.dtype == np.uint8
-        found.append(image.find_saturated(white_level))
-        observations[:, position] = image.observe()
-        if image.linear.shape[1] == 3:
-            colours.append(replace(image, linear=image.linear[compared]).colours())
-        del image  # before the next one is decoded
-    saturation = Saturation(n_pixels, tuple(found), white_level)
-    warnings = white_level_warnings(saturation.white_level)
-    saturated = int(saturation.n_saturated.sum()) / max(n_pixels * n_images, 1)
-    if saturated > codes.SATURATED_SHARE:
-        text = (
-            f"{100 * saturated:.1f} % of the observations are saturated; a shorter exposure gives"
-            " better normals."
-        )
-        warnings.append(CaptureWarning(codes.SATURATED, text))
-    black = (n_pixels - np.count_nonzero(observations[:n_pixels].any(axis=1))) / max(n_pixels, 1)
-    if black > 0.01:
-        text = (
-            f"{100 * black:.1f} % of the pixels are black under every light; they get the normal"
-            " (0, 0, 1)."
-        )
-        text += " Leave them out with a mask or with --auto-mask."
-        warnings.append(CaptureWarning(codes.BLACK_PIXELS, text))
-    of_lamps, found_warnings = (
-        lamp_colours(np.stack(colours)) if len(colours) == n_images else (None, [])
-    )
-    return (
-        observations,
-        saturation,
-        [*warnings, *codes.eight_bit(any_8_bit), *found_warnings],
-        of_lamps,
-    )
-
-
-def read_observations(
-    images: Callable[[Float64Array | None], Iterable[StoredPixels]],
-    mask: Bools,
-    around: Bools | None,
-    n_images: int,
-    white_level: float | None,
-    *,
-    divides_colours: bool = True,
-) -> Observed:
-    """Return the observations of a mask's pixels, without the blur of the lens and the colours of
-    lamps that differ.
-
-    Args:
-        images: gives the pixels of the images, divided by the colours (F, 3) of the lamps if it is
-            given some.
-        around: the pixels around the mask, whose observations follow those of the mask, to find the
-            blur; None for images whose blur stays.
-        white_level: see collect_observations.
-        divides_colours: whether the lamps may have different colours.
-    """
-    sizes = (
-        int(np.count_nonzero(mask)),
-        n_images,
-        white_level,
-        0 if around is None else int(np.count_nonzero(around)),
-    )
-    observations, saturation, warnings, colours = collect_observations(images(None), *sizes)
-    if not divides_colours:
-        warnings, colours = (
-            [each for each in warnings if each.kind != codes.ESTIMATED_COLOURS],
-            None,
-        )
-    if colours is not None:  # only the mean of the channels was kept, so the images are read again
-        del observations
-        of_colours = [each for each in warnings if each.kind == codes.ESTIMATED_COLOURS]
-        observations, saturation, warnings, _ = collect_observations(images(colours), *sizes)
-        warnings = [
-            *of_colours,
-            *(each for each in warnings if each.kind != codes.ESTIMATED_COLOURS),
-        ]
-    blur = None if around is None else remove_blur(observations, mask, around)
-    return Observed(observations[: sizes[0]], saturation, warnings, colours, blur)

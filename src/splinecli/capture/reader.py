@@ -1,14 +1,13 @@
-"""Open a capture: find its files and read its lights, or take arrays that are already in memory."""
+"""Open a capture: find its files and read its lights."""
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from splinecli.capture import linearise, near_lamps
 from splinecli.capture.channel_lights import CHANNELS, CROSSTALK, channel_lights
@@ -33,15 +32,13 @@ from splinecli.capture.light_files import (
     match_images,
     read_light_intensities,
     read_lights,
-    unit_directions,
 )
 from splinecli.capture.light_rows import USUAL_FRAME, LightForm, LightFrame, RowForm
-from splinecli.capture.record import Capture, LightFinder, StoredCapture, placeholders
-from splinecli.capture.source import CaptureSource, Progress
+from splinecli.capture.record import placeholders
+from splinecli.capture.source import CaptureSource
 from splinecli.errors import InputError, UsageError
-from splinecli.images.lens_blur import surroundings
 from splinecli.images.saturation import check_white_level
-from splinecli.maths import Array, Float64Array
+from splinecli.maths import Float64Array
 from splinecli.records import capture_warnings as codes
 from splinecli.records.capture_warnings import CaptureWarning
 from splinecli.system.files import StrPath
@@ -62,7 +59,7 @@ def open_capture(
     lights_format: LightForm = "xyz",
     lamps: near_lamps.LampOptions = near_lamps.NO_LAMP_OPTIONS,
     window: linearise.Window = linearise.WHOLE,
-    find_lights: LightFinder | None = None,
+    needs_lights: bool = True,
     lights_in_channels: bool = False,
     crosstalk: StrPath | None = None,
 ) -> CaptureSource:
@@ -78,7 +75,7 @@ def open_capture(
             for 12 bits. By default it is found from the files and their values (see WhiteLevel).
         lights_format: whether the rows of a light file of text are vectors or angles.
         lamps: positions of near lamps, and the camera, unless files in the folder give them.
-        find_lights: estimates the lights from the images, instead of reading light files.
+        needs_lights: whether light files are read. Without them, the lights have to be estimated.
         lights_in_channels: whether the channels of each image are observations under three lights;
             see ChannelLights.
         crosstalk: a file with their crosstalk, instead of that in the folder.
@@ -99,16 +96,14 @@ def open_capture(
     equal = intensities is not None and str(intensities) == EQUAL
     given = (lights, None if equal else intensities, mask, ground_truth)
     paths = (None if file is None else Path(file) for file in given)
-    overrides = Overrides(*paths, needs_lights=find_lights is None)
+    overrides = Overrides(*paths, needs_lights=needs_lights)
     if lamps.positions is not None and lights is not None:
         raise UsageError(
             "--lights and --light-positions contradict each other", hint="Leave one out"
         )
     form: RowForm = lights_format
     near = (
-        None
-        if find_lights is not None
-        else near_lamps.find_lamps(Path(folder), overrides.lights, lamps)
+        None if not needs_lights else near_lamps.find_lamps(Path(folder), overrides.lights, lamps)
     )
     if near is not None and near.used and near.positions is not None:
         if lights_format != "xyz":
@@ -207,13 +202,13 @@ def open_capture(
         )
         warnings.append(CaptureWarning(codes.EXIF_ORIENTATION, text))
     return CaptureSource(
-        files,
-        facts,
-        directions,
-        factors if found_intensities is None else found_intensities,
-        tuple(warnings),
-        radiometry,
-        white_level,
+        files=files,
+        facts=facts,
+        light_directions=directions,
+        light_intensities=factors if found_intensities is None else found_intensities,
+        warnings=tuple(warnings),
+        radiometry=radiometry,
+        white_level=white_level,
         intensities_known=equal or found_intensities is not None,
         intensities_measured=found_intensities is not None,
         light_frame=light_frame,
@@ -221,41 +216,9 @@ def open_capture(
         camera_matrix=camera_matrix,
         channels=channels,
         window=window.on(facts[0]),
-        find_lights=find_lights,
         # Omitted if they are not given, so that earlier stamps stay valid.
         stamp=(*stamp, *decoded, *(() if white_level is None else (white_level,))),
     )
-
-
-def read_capture(
-    folder: StrPath,
-    *,
-    lights: StrPath | None = None,
-    intensities: StrPath | None = None,
-    mask: StrPath | None = None,
-    ground_truth: StrPath | None = None,
-    light_indices: Sequence[int] | None = None,
-    progress: Progress | None = None,
-    as_stored: bool = False,
-    white_level: float | None = None,
-) -> Capture:
-    """Open a capture with open_capture and read it with CaptureSource.read.
-
-    Examples:
-        >>> from splinecli.capture import read_capture
-        >>> capture = read_capture("examples/medallion", light_indices=[0, 2, 4])
-        >>> capture.observations.shape, capture.light_directions.shape
-        ((11836, 3), (3, 3))
-    """
-    source = open_capture(
-        folder,
-        lights=lights,
-        intensities=intensities,
-        mask=mask,
-        ground_truth=ground_truth,
-        white_level=white_level,
-    )
-    return source.read(light_indices, progress or (lambda: None), as_stored=as_stored)
 
 
 def _read_lights(
@@ -372,168 +335,3 @@ def _read_intensities(
                 [in_folder.index(image) for image in images]
             ]
     return read_light_intensities(path, len(images))
-
-
-def capture_from_arrays(
-    images: ArrayLike | Sequence[Array],
-    light_directions: ArrayLike | None,
-    mask: ArrayLike | None = None,
-    *,
-    light_intensities: ArrayLike | None = None,
-    pixel_size: float | None = None,
-    camera_matrix: ArrayLike | None = None,
-    white_level: float | None = None,
-    as_stored: bool = False,
-    find_lights: LightFinder | None = None,
-) -> Capture:
-    """Return the capture of these images, restored as `infer` restores the capture of a folder.
-
-    Args:
-        images: (F, H, W) gray or (F, H, W, 3) RGB, linear. uint8 and uint16 values are scaled by
-            their full range; floating-point values are taken as they are.
-        light_directions: (F, 3), towards the lights, of any length; x right, y up, z to the camera.
-            None to find them with find_lights.
-        mask: (H, W), True at the pixels of the object, or numbers above half of their largest one,
-            as in a mask file. None takes all pixels.
-        light_intensities: (F,) or (F, 3) RGB. None means that they are unknown.
-        pixel_size: for near lamps, the width of a pixel on the object; light_directions are then
-            positions in this unit, from the middle of the image on the object's mean plane. None
-            for distant lights.
-        camera_matrix: (3, 3) in pixels, as in OpenCV. None is an orthographic camera.
-        white_level: the value from which an observation is saturated, in the unit of the images.
-            None finds it for integer images; floating-point images then have none.
-        as_stored: use the values alone. By default, the blur of the lens is removed, saturated
-            observations are restored, and unknown light intensities are estimated.
-        find_lights: finds the lights from the images, where none are given.
-
-    Raises:
-        UsageError: a shape or a type does not fit.
-        InputError: a value is not finite or negative, the lights cannot give normals, or the mask
-            is empty.
-    """
-    stack = _checked_images(images)
-    shape, n_lights = stack[0].shape[:2], len(stack)
-    if light_directions is None and find_lights is None:
-        raise UsageError("found neither light directions nor a function that finds them")
-    if light_directions is None and pixel_size is not None:
-        raise UsageError(
-            "light_directions is None, but near lamps need positions", hint="Leave pixel_size out"
-        )
-    directions = (
-        placeholders(n_lights)
-        if light_directions is None
-        else _checked_directions(light_directions, n_lights)
-    )
-    intensities = _checked_intensities(light_intensities, n_lights)
-    inside = np.ones(shape, np.bool_) if mask is None else np.array(mask)
-    if inside.dtype != np.bool_:  # the rule of mask files for numbers
-        inside = inside > max(inside.max(initial=0) / 2, 0)
-    if inside.shape != shape:
-        raise UsageError(
-            f"found a mask of shape {inside.shape}, expected (H, W) = {shape} as the images"
-        )
-
-    if not inside.any():
-        raise InputError("capture: the mask is empty")
-    around = None if as_stored else surroundings(inside)
-
-    def read(colours: Float64Array | None) -> Iterator[linearise.StoredPixels]:
-        rgb = intensities if colours is None else intensities * colours
-        for index, image in enumerate(stack):
-            pixels = image if image.ndim == 3 else image[..., None]
-            values, path = pixels[inside], Path(f"images[{index}]")
-            used = (
-                values
-                if around is None
-                else np.concatenate((values, linearise.take_around(pixels, around)))
-            )
-            yield linearise.StoredPixels(
-                path, values, linearise.linear_light(used, path), rgb[index]
-            )
-
-    observed = linearise.read_observations(
-        read, inside, around, n_lights, white_level, divides_colours=not as_stored
-    )
-    matrix = None if camera_matrix is None else np.asarray(camera_matrix, np.float64)
-    capture = Capture(
-        "capture",
-        observed.observations,
-        directions,
-        tuple(range(n_lights)),
-        inside,
-        warnings=tuple(observed.warnings),
-        estimated_colours=observed.colours,
-        white_level=observed.saturation.white_level,
-        removed_blur=observed.blur,
-        camera_matrix=matrix,
-    )
-    known = light_intensities is not None
-    if pixel_size is not None:
-        positions = np.asarray(light_directions, np.float64)
-        lamps = near_lamps.NearLamps.of(
-            positions, pixel_size, shape, equal=not known, camera_matrix=matrix
-        )
-        warnings = [*observed.warnings, *near_lamps.check_distances(lamps, inside, None)]
-        capture = replace(capture, lamps=lamps, camera_matrix=None, warnings=tuple(warnings))
-    stored = StoredCapture(capture, observed.saturation, intensities_known=known)
-    if light_directions is None and find_lights is not None:
-        stored = stored.find_lights(find_lights)
-    return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
-
-
-def _checked_images(images: ArrayLike | Sequence[Array]) -> list[Array]:
-    stack = [np.asarray(image) for image in images]  # type: ignore[union-attr]
-    if not stack:
-        raise UsageError("found no images, expected (F, H, W) or (F, H, W, 3)")
-    for index, image in enumerate(stack):
-        first = stack[0].shape
-        if image.shape != first:
-            raise UsageError(
-                f"found an image of shape {image.shape} at images[{index}], expected {first} as"
-                " images[0]"
-            )
-        if (
-            image.ndim not in (2, 3)
-            or not image.size
-            or (image.ndim == 3 and image.shape[2] not in (1, 3))
-        ):
-            raise UsageError(
-                f"found images of shape {(len(stack), *image.shape)}, expected (F, H, W) or (F, H,"
-                " W, 3)"
-            )
-        if image.dtype not in (np.uint8, np.uint16) and image.dtype.kind != "f":
-            problem = (
-                f"found images of type {image.dtype}, expected uint8, uint16 or floating point"
-            )
-            raise UsageError(
-                problem, hint="Convert them with images.astype(...), without a change of scale"
-            )
-    return stack
-
-
-def _checked_directions(directions: ArrayLike, n_lights: int) -> Float64Array:
-    vectors = np.asarray(directions, np.float64)
-    if vectors.shape != (n_lights, 3):
-        expected = f"(F, 3) = {(n_lights, 3)}, one for each image"
-        raise UsageError(f"found light directions of shape {vectors.shape}, expected {expected}")
-    if not np.isfinite(vectors).all():
-        raise InputError("a light direction is not finite")
-    rows = [f" in row {row}" for row in range(n_lights)]
-    return unit_directions(vectors, Path("light_directions"), [None] * n_lights, rows)
-
-
-def _checked_intensities(intensities: ArrayLike | None, n_lights: int) -> Float64Array:
-    """Return intensities (F, 3); ones where none are given."""
-    if intensities is None:
-        return np.ones((n_lights, 3))
-    values = np.asarray(intensities, np.float64)
-    if values.shape == (n_lights,):
-        values = values[:, None]
-    if values.shape not in ((n_lights, 1), (n_lights, 3)):
-        shape = values.shape
-        raise UsageError(
-            f"found light intensities of shape {shape}, expected (F,) or (F, 3) with F = {n_lights}"
-        )
-    if not (np.isfinite(values) & (values > 0)).all():
-        raise InputError("a light intensity is not a finite number above 0")
-    return np.broadcast_to(values, (n_lights, 3))

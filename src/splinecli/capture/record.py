@@ -1,25 +1,20 @@
-"""The capture record that all steps after reading use, the same with stored values, and lights
-estimated from the images."""
+"""The capture record that all steps after the recipe use, and lights estimated from the images."""
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.errors import InputError, UsageError
-from splinecli.images.lamps import estimate_light_intensities
-from splinecli.images.saturation import Saturation, restore_saturated
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Integers
 from splinecli.maths.pixel_grid import ray_basis
 from splinecli.maths.robust import MIN_LIGHTS
 from splinecli.records.capture_warnings import (
-    ESTIMATED_INTENSITIES,
     CaptureWarning,
-    estimated_lights,
 )
 from splinecli.records.white_level import WhiteLevel
 
@@ -71,11 +66,6 @@ def placeholders(n_lights: int) -> Float64Array:
     azimuth = 2 * np.pi * np.arange(n_lights) / max(n_lights, 1)
     return np.stack((0.6 * np.cos(azimuth), 0.6 * np.sin(azimuth), np.full(n_lights, 0.8)), axis=1)
 
-
-LightFinder = Callable[[Float32Array, Bools, bool], FoundLights]
-"""Finds lights from observations (P, F), the mask (H, W) of their pixels, and whether the
-intensities are known.
-"""
 
 _UNIT_TOLERANCE = 1e-3
 _DTYPES: dict[type[np.generic], tuple[str, ...]] = {
@@ -304,120 +294,5 @@ def _blocks(rows: Float32Array, size: int = 1 << 20) -> Iterator[Float32Array]:
 
 
 def name_reading(*, as_stored: bool) -> str:
-    """Return how CaptureSource.read read a capture, in the words of reports and pixel sets."""
+    """Return how a capture was prepared, in the words of reports and pixel sets."""
     return "as stored" if as_stored else "restored"
-
-
-@dataclass(frozen=True, eq=False)
-class StoredCapture:
-    """A capture as its files store it, with the data needed to restore it.
-
-    `infer` reads the lights it uses and restores the capture once. `evaluate` reads all lights
-    once, chooses the lights of each draw, and restores each choice by itself, so that both commands
-    see the same observations. The white level of a choice is decided from its images alone.
-    """
-
-    capture: Capture  # linear observations, divided by the light intensities that the files give
-    saturation: Saturation
-    # whether a file, an option or the image format gives the light intensities
-    intensities_known: bool
-    # (F,), estimated together with the directions, or None
-    found_intensities: Float64Array | None = None
-
-    def find_lights(self, find: LightFinder) -> StoredCapture:
-        """Return the capture under lights that are estimated from these observations.
-
-        Raises InputError if the images do not determine the lights, or the estimated lights cannot
-        give normals.
-        """
-        capture = self.capture
-        try:
-            found = find(capture.observations, capture.mask, self.intensities_known)
-        except InputError as error:
-            raise InputError(f"{capture.name}: {error.problem}", hint=error.hint) from None
-        warnings, directions = (
-            (*capture.warnings, estimated_lights(found.errors_deg)),
-            found.directions,
-        )
-        capture = replace(
-            capture,
-            light_directions=directions,
-            light_errors_deg=found.errors_deg,
-            warnings=warnings,
-        )
-        return replace(self, capture=capture, found_intensities=found.intensities)
-
-    def choose_lights(self, positions: Sequence[int]) -> StoredCapture:
-        """Return the capture under some of its lights, with arrays of its own, but the warnings of
-        all lights.
-        """
-        capture, saturation = (
-            self.capture.choose_lights(positions),
-            self.saturation.choose_images(positions),
-        )
-        if saturation.white_level != capture.white_level:
-            capture = replace(capture, white_level=saturation.white_level)
-        found = None if self.found_intensities is None else self.found_intensities[list(positions)]
-        return replace(self, capture=capture, saturation=saturation, found_intensities=found)
-
-    def choose_pixels(self, rows: Integers) -> StoredCapture:
-        """Return the capture with these rising rows of its observations, with arrays of its own."""
-        return replace(
-            self,
-            capture=self.capture.choose_pixels(rows),
-            saturation=self.saturation.choose_pixels(rows),
-        )
-
-    def estimate_intensities(self) -> Float64Array | None:
-        """Return light intensities (F,) estimated from all pixels; None if they are known or
-        assumed equal.
-        """
-        if self.intensities_known or self.found_intensities is not None:
-            return self.found_intensities
-        return estimate_light_intensities(
-            self.capture.observations, self.saturation.flags, self._lights_of
-        )
-
-    def restore(self, intensities: Float64Array | None) -> Capture:
-        """Return the capture with its intensities divided out and its saturated observations
-        restored.
-
-        The observations are changed in place: this record must not be used afterwards.
-        """
-        observations, warnings = self.capture.observations, self.capture.warnings
-        if intensities is not None:
-            observations /= intensities.astype(np.float32)
-            lowest, highest = intensities.min(), intensities.max()
-            digits = 4 if f"{lowest:.2f}" == f"{highest:.2f}" else 2
-            text = (
-                "The light intensities were estimated from the images: they are unequal, from"
-                f" {lowest:.{digits}f} to"
-                f" {highest:.{digits}f} times their mean. Use --intensities FILE if you"
-                " have measured them, or"
-                " --intensities equal to assume equal ones."
-            )
-            warnings = (*warnings, CaptureWarning(ESTIMATED_INTENSITIES, text))
-        saturated = self.saturation.flags
-        restored = (
-            None
-            if saturated is None
-            else restore_saturated(observations, saturated, self._lights_of)
-        )
-        if intensities is None and restored is None:
-            return self.capture
-        return replace(
-            self.capture, warnings=warnings, estimated_intensities=intensities, restored=restored
-        )
-
-    def _lights_of(self, rows: Integers) -> Float64Array:
-        """Return the light vectors of some pixels: (F, 3), or (p, F, 3) with the falloff of near
-        lamps on a plane.
-        """
-        lamps = self.capture.lamps
-        if lamps is None:
-            return self.capture.light_directions
-        places = np.flatnonzero(self.capture.mask)[rows]
-        directions, attenuation = lamps.light_at(
-            lamps.plane_points(*np.divmod(places, self.capture.mask.shape[1]))
-        )
-        return np.asarray(directions * attenuation[..., None], np.float64)

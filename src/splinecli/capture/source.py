@@ -14,7 +14,7 @@ import numpy as np
 from splinecli.capture import linearise
 from splinecli.capture.channel_lights import ChannelLights
 from splinecli.capture.files import CaptureFiles
-from splinecli.capture.formats.decoders import stderr_is_apart
+from splinecli.capture.formats.decoders import page_of, stderr_is_apart
 from splinecli.capture.formats.facts import ImageHeader, StoredSize
 from splinecli.capture.formats.images import (
     ExpectedSize,
@@ -35,28 +35,17 @@ from splinecli.capture.linearise import (
     Window,
 )
 from splinecli.capture.near_lamps import LampFiles, NearLamps, check_distances, distant_lights
-from splinecli.capture.record import Capture, LightFinder, StoredCapture, check_light_indices
+from splinecli.capture.record import check_light_indices
 from splinecli.errors import InputError, UsageError
-from splinecli.images.alignment import (
-    LARGEST_MOTION,
-    MIN_IMAGES,
-    AlignedImages,
-    align_images,
-    common_pixels,
-    place_in_whole,
-    reduced,
-    resample,
-    stride_for,
-)
-from splinecli.images.lens_blur import surroundings
-from splinecli.images.saturation import find_object, looks_inverted, surrounds_hole
+from splinecli.images.alignment import AlignedImages, resample
+from splinecli.images.saturation import looks_inverted, surrounds_hole
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Integers
 from splinecli.records.capture_warnings import (
     GROUND_TRUTH_UPSIDE_DOWN,
-    IMAGES_ALIGNED,
     CaptureWarning,
     mask_inverted,
 )
+from splinecli.system.files import equal_files, reading
 from splinecli.system.machine import in_order
 
 Item = TypeVar("Item")
@@ -66,46 +55,173 @@ Image = TypeVar("Image")
 BYTES_OF_RESULTS = 52
 Progress = Callable[[], object]  # called once after each image
 
-LEAST_COMMON = 0.25  # share of the object that all aligned images must show
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Source:
+    """Images of one object and their lights; the pixels are read one image at a time.
 
-@dataclass(frozen=True, eq=False)
-class CaptureSource:
-    """An opened capture: lights and facts of images loaded, pixels still on disk."""
+    The recipe (recipe/steps.py) turns a source into a Capture. Files and arrays each have a
+    subclass.
+    """
 
-    files: CaptureFiles
-    facts: tuple[ImageHeader, ...]
-    light_directions: Float64Array  # (F, 3), unit; x right, y up, z to the camera. See find_lights
-    light_intensities: Float64Array  # (F, 3), RGB; ones if no file gives them
+    light_directions: Float64Array  # (F, 3), unit; x right, y up, z to the camera
+    light_intensities: Float64Array  # (F, 3), RGB; ones if they are unknown
     warnings: tuple[CaptureWarning, ...] = ()
-    radiometry: RadiometricCalibration = AS_STORED
     # stored value from which an observation is saturated; None to find it
     white_level: float | None = None
-    # (H, W), made from the images instead of a file; see find_mask
-    automatic_mask: Bools | None = None
-    # the motion of the images, which is undone when they are read; see align
-    alignment: AlignedImages | None = None
     intensities_known: bool = True  # whether a file or the user gives the intensities
     intensities_measured: bool = True  # whether a file gives the intensities
     # the frame of the light file, in which the directions are no longer
     light_frame: LightFrame = USUAL_FRAME
-    lamps: LampFiles | None = None  # the near lamps of files and options, or None
     # (3, 3) in pixels of whole images. None is an orthographic camera
     camera_matrix: Float64Array | None = None
+
+    @property
+    def n_lights(self) -> int:
+        return len(self.light_directions)
+
+    @property
+    def name(self) -> str:
+        raise NotImplementedError
+
+    @property
+    def has_mask(self) -> bool:
+        """Whether the mask is given, so that none is found in the images."""
+        return True
+
+    @property
+    def has_neighbours(self) -> bool:
+        """Whether neighbouring pixels of the images are read, so that lens blur can be removed."""
+        return True
+
+    @property
+    def lamps_may_differ(self) -> bool:
+        """Whether the lamps may have different colours: nobody says that they are equal."""
+        return self.intensities_measured or not self.intensities_known
+
+    @property
+    def has_positions(self) -> bool:
+        """Whether positions of lamps are known."""
+        raise NotImplementedError
+
+    @property
+    def lights_file(self) -> Path:
+        """The file of the lights, for messages."""
+        return Path("light_directions")
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether the stored values are taken as linear light."""
+        return True
+
+    @property
+    def in_channels(self) -> bool:
+        """Whether each channel of a colour image has a light of its own."""
+        return False
+
+    def image_names(self, indices: Sequence[int]) -> list[str]:
+        """Return the names of images for messages."""
+        raise NotImplementedError
+
+    def mask_for(self, indices: Sequence[int]) -> Bools:
+        """Return the mask (H, W). Raises InputError if the sizes of these images differ, or the
+        memory is too small.
+        """
+        raise NotImplementedError
+
+    def read_ground_truth(self, mask: Bools) -> tuple[Float32Array | None, list[CaptureWarning]]:
+        """Return the true normals (H, W, 3) over a mask, or None, and warnings."""
+        return None, []
+
+    def near_lamps(self, mask: Bools) -> tuple[NearLamps | None, list[CaptureWarning]]:
+        """Return all near lamps over a mask (H, W), or None for distant lights, and warnings."""
+        raise NotImplementedError
+
+    def lamps_on_grid(self, mask: Bools, step: int) -> NearLamps | None:
+        """Return the near lamps over a mask (h, w) of every step-th row and column, or None."""
+        raise NotImplementedError
+
+    def mask_warnings(self, mask: Bools, indices: Sequence[int]) -> list[CaptureWarning]:
+        """Warn of a mask (H, W) that is probably inverted."""
+        return []
+
+    def camera(self) -> Float64Array | None:
+        """Return the camera matrix (3, 3) of the pixels that are read."""
+        return self.camera_matrix
+
+    def has_8_bits(self, indices: Sequence[int]) -> bool:
+        """Return whether an image states that it has 8 bits."""
+        return False
+
+    def equal_images(self, indices: Sequence[int]) -> list[tuple[int, int]]:
+        """Return the pairs of places of images whose files are equal."""
+        return []
+
+    def read_pixels(
+        self,
+        mask: Bools,
+        indices: Sequence[int],
+        use: Callable[[StoredPixels], Item],
+        progress: Progress = lambda: None,
+        wanted: Integers | slice = linearise.EVERY_PIXEL,
+        around: Bools | None = None,
+    ) -> Iterator[Item]:
+        """Yield use(...) of the pixels of a mask (H, W) under these lights.
+
+        Of these pixels (P,), the stored values are complete; for the linear ones, see
+        pixel_reader.
+        """
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CaptureSource(Source):
+    """An opened capture: lights and facts of images loaded, pixels still on disk."""
+
+    files: CaptureFiles
+    facts: tuple[ImageHeader, ...]
+    radiometry: RadiometricCalibration = AS_STORED
+    # (H, W), made from the images instead of a file
+    automatic_mask: Bools | None = None
+    # the motion of the images, which is undone when they are read
+    alignment: AlignedImages | None = None
+    lamps: LampFiles | None = None  # the near lamps of files and options, or None
     # if each channel of a colour image is an image of its own
     channels: ChannelLights | None = None
     # the part of the images that is read. All masks but those in files have its size
     window: Window = WHOLE
-    # finds the lights from the images; then the directions mean nothing
-    find_lights: LightFinder | None = None
     # JSON values that change when a file that is read for the capture, or the given white level,
     # does. They are taken before reading, so a file that changed meanwhile has another stamp the
     # next time
     stamp: tuple[Any, ...] = ()
 
     @property
-    def n_lights(self) -> int:
-        return len(self.light_directions)
+    def name(self) -> str:
+        return self.files.name
+
+    @property
+    def has_mask(self) -> bool:
+        return self.files.mask is not None or bool(self.files.boundaries)
+
+    @property
+    def has_neighbours(self) -> bool:
+        return self.window.step == 1
+
+    @property
+    def has_positions(self) -> bool:
+        return self.lamps is not None
+
+    @property
+    def lights_file(self) -> Path:
+        return self.files.light_directions or super().lights_file
+
+    @property
+    def is_linear(self) -> bool:
+        return self.radiometry.curve == 1
+
+    @property
+    def in_channels(self) -> bool:
+        return self.channels is not None
 
     def image_names(self, indices: Sequence[int]) -> list[str]:
         """Return the names of images for messages, with the channel if each channel is an image of
@@ -127,202 +243,13 @@ class CaptureSource:
                 raise UsageError(f"light {number} was left out, and cannot be chosen", hint=hint)
         return [self.files.kept.index(number) for number in light_numbers]
 
-    def read(
-        self,
-        light_indices: Sequence[int] | None = None,
-        progress: Progress = lambda: None,
-        *,
-        as_stored: bool = False,
-    ) -> Capture:
-        """Return the capture under the chosen lights (None for all), in the order given.
-
-        Only the images of these lights are read. At most one full image is in memory beside the
-        result. Values outside the mask are ignored.
-
-        Args:
-            as_stored: use the stored values alone. By default, the blur of the lens is removed (see
-                remove_blur), saturated observations are restored (see restore_saturated), and light
-                intensities that no file gives are estimated (see estimate_light_intensities).
-
-        Raises:
-            UsageError: an index is out of range or repeated, or there are fewer than three.
-            InputError: an image, the mask or the ground truth cannot be read or does not fit the
-                others, or Capture rejects the lights.
-        """
-        stored = self.read_stored(light_indices, progress, as_stored=as_stored)
-        return stored.capture if as_stored else stored.restore(stored.estimate_intensities())
-
-    def read_stored(
-        self,
-        light_indices: Sequence[int] | None = None,
-        progress: Progress = lambda: None,
-        *,
-        as_stored: bool = False,
-    ) -> StoredCapture:
-        """Return the values under the chosen lights and the data needed to restore the saturated
-        ones; see read.
-
-        Unless `as_stored` is set, the blur of the lens is removed (see remove_blur), and colours of
-        lamps that differ are divided out, unless the user states that lamps are equal.
-        """
-        everything = tuple(range(self.n_lights))
-        indices = (
-            everything
-            if light_indices is None
-            else check_light_indices(light_indices, self.n_lights)
-        )
-        mask = self._read_mask_if_room(indices)
-        ground_truth, upside_down = None, False
-        if self.files.ground_truth is not None:
-            ground_truth, upside_down = read_ground_truth(
-                self.files.ground_truth, self.window.whole(mask)
-            )
-            ground_truth = self.window.of(ground_truth)
-        around = surroundings(mask) if not as_stored and self.window.step == 1 else None
-
-        def images(colours: Float64Array | None) -> Iterator[StoredPixels]:
-            rgb = self.light_intensities.copy()
-            if colours is not None:
-                rgb[list(indices)] *= colours
-            source = replace(self, light_intensities=rgb)
-            return source.read_pixels(mask, indices, lambda pixels: pixels, progress, around=around)
-
-        equal = self.intensities_known and not self.intensities_measured
-        observed = linearise.read_observations(
-            images,
-            mask,
-            around,
-            len(indices),
-            self.white_level,
-            divides_colours=not (equal or as_stored),
-        )
-        warnings = [*self.warnings, *observed.warnings]
-        if upside_down:
-            text = "The rows of the ground truth are in reverse order, so the map was flipped."
-            warnings.append(CaptureWarning(GROUND_TRUTH_UPSIDE_DOWN, text))
-        lamps, of_lamps = self.near_lamps(mask)
-        warnings += [*of_lamps, *self.mask_warnings(mask, indices)]
-        camera = (
-            None
-            if lamps is not None or self.camera_matrix is None
-            else self.window.camera(self.camera_matrix)
-        )
-        capture = Capture(
-            self.files.name,
-            observed.observations,
-            self.light_directions[list(indices)],
-            indices,
-            mask,
-            ground_truth,
-            tuple(warnings),
-            estimated_colours=observed.colours,
-            white_level=observed.saturation.white_level,
-            removed_blur=observed.blur,
-            lamps=None if lamps is None else lamps.choose_lights(indices),
-            camera_matrix=camera,
-        )
-        stored = StoredCapture(capture, observed.saturation, self.intensities_known)
-        return stored if self.find_lights is None else stored.find_lights(self.find_lights)
-
-    def find_mask(self, progress: Progress = lambda: None) -> CaptureSource:
-        """Return this capture with a mask made from all its images (see find_object), unless it has
-        a mask already.
-
-        Raises InputError if no object stands out, or an image cannot be read.
-        """
-        if self.files.mask is not None or self.files.boundaries:
-            return self
-        everywhere = self.window.of(np.ones(common_size(self.facts)[0][:2], np.bool_))
-        total = np.zeros(everywhere.size, np.float32)
-        for colours in self.read_pixels(
-            everywhere, range(self.n_lights), StoredPixels.colours, progress
-        ):
-            total += colours.mean(axis=1)
-        try:
-            mask = find_object(total.reshape(everywhere.shape))
-        except InputError as error:
-            raise InputError(error.problem, path=self.files.folder, hint=error.hint) from None
-        return replace(
-            self, automatic_mask=mask if self.alignment is None else mask & self.alignment.common
-        )
-
-    def align(
-        self, light_indices: Sequence[int] | None = None, progress: Progress = lambda: None
-    ) -> CaptureSource:
-        """Return this capture with the chosen images (None for all) aligned to the first of them;
-        see align_images.
-
-        Raises InputError if there are too few images, one does not fit the others, or they share
-        too little of the object.
-        """
-        indices = list(range(self.n_lights) if light_indices is None else light_indices)
-        names = [self.files.images[index].name for index in indices]
-        if len(indices) < MIN_IMAGES:
-            problem = (
-                f"--align predicts each image from the others: found {len(indices)}, expected at"
-                f" least {MIN_IMAGES}"
-            )
-            raise InputError(
-                problem, path=self.files.folder, hint="Add images, or leave --align out"
-            )
-        shape = common_size([self.facts[index] for index in indices])[0][:2]
-        mask = self.read_mask(shape)
-        stride = stride_for(len(indices) * mask.size)
-        read = self.read_pixels(np.ones_like(mask), indices, StoredPixels.observe, progress)
-        images = np.stack([reduced(image.reshape(mask.shape), stride) for image in read])
-        lights = None if self.find_lights is not None else self.light_directions[indices]
-        found = align_images(images, reduced(mask.astype(np.float32), stride) > 0.5, lights)
-        if found.unexplained is not None:
-            name, fit = names[found.unexplained], found.fits[found.unexplained]
-            if fit < found.least_fit:
-                problem = (
-                    f"--align cannot match {name} to the other images: at best, its correlation"
-                    " with their prediction"
-                    f" is {fit:.2f}, expected at least {found.least_fit:.2f}"
-                )
-                hint = "Leave it out with --light-indices, mask the object, or leave --align out"
-                raise InputError(problem, path=self.files.folder, hint=hint)
-            pixels = stride * found.moved_pixels[found.unexplained]
-            problem = (
-                f"--align found that {name} moved by {pixels:.0f} pixels, at one pixel by"
-                f" {100 * found.largest:.0f} %"
-            )
-            problem += f" of the object's size; expected at most {100 * LARGEST_MOTION:.0f} %"
-            hint = (
-                "Read a larger part of the images, leave the image out with --light-indices, or"
-                " leave --align out"
-            )
-            raise InputError(problem, path=self.files.folder, hint=hint)
-        left, top, *_ = self.window.box or (0, 0)
-        transforms = np.repeat(np.eye(3)[None], self.n_lights, axis=0)
-        transforms[indices] = place_in_whole(found.transforms, left, top, stride)
-        common = self.window.of(common_pixels(transforms, shape))
-        share = np.count_nonzero(mask & common) / np.count_nonzero(mask)
-        if share < LEAST_COMMON:
-            problem = (
-                f"the aligned images share {100 * share:.0f} % of the object, expected"
-                f" {100 * LEAST_COMMON:.0f} %"
-            )
-            raise InputError(
-                problem,
-                path=self.files.folder,
-                hint="Leave out the images that show another part of it",
-            )
-        moved, warnings = found.moved_pixels * stride, self.warnings
-        if (found.transforms != np.eye(3)).any():
-            text = (
-                f"The images were aligned to {names[0]}: they moved by up to {moved.max():.1f}"
-                " pixels"
-            )
-            text += f" ({found.model})"
-            if share < 1:
-                text += (
-                    f"; {100 - 100 * share:.1f} % of the object is left out, because it is not in"
-                    " every image"
-                )
-            warnings = (*warnings, CaptureWarning(IMAGES_ALIGNED, f"{text}."))
-        aligned = AlignedImages(names[0], found.model, transforms, moved, common)
-        return replace(self, alignment=aligned, warnings=warnings)
+    def read_ground_truth(self, mask: Bools) -> tuple[Float32Array | None, list[CaptureWarning]]:
+        if self.files.ground_truth is None:
+            return None, []
+        truth, upside_down = read_ground_truth(self.files.ground_truth, self.window.whole(mask))
+        text = "The rows of the ground truth are in reverse order, so the map was flipped."
+        warnings = [CaptureWarning(GROUND_TRUTH_UPSIDE_DOWN, text)] * upside_down
+        return self.window.of(truth), warnings
 
     def read_mask(self, shape: tuple[int, ...]) -> Bools:
         """Return the mask (H, W) of the window on images of this shape. Raises InputError, also for
@@ -367,18 +294,34 @@ class CaptureSource:
         brightness = np.sum(list(images), axis=0).reshape(mask.shape)
         return [mask_inverted(path.name)] if looks_inverted(mask, brightness) else []
 
-    def _read_mask_if_room(self, indices: Sequence[int]) -> Bools:
-        """Return the mask (H, W). Raises InputError if the sizes of images differ or the memory is
-        too small.
-        """
+    def mask_for(self, indices: Sequence[int]) -> Bools:
         size = common_size([self.facts[index] for index in indices])
         shape = size[0][:2]
-        if self.automatic_mask is None and self.files.mask is None and not self.files.boundaries:
+        if self.automatic_mask is None and not self.has_mask:
             n_pixels = self.window.of(np.broadcast_to(np.True_, shape)).size
-            check_capture(size, n_pixels, len(indices), self.files.folder)
+            check_room(size, n_pixels, len(indices), self.files.folder)
         mask = self.read_mask(shape)
-        check_capture(size, int(np.count_nonzero(mask)), len(indices), self.files.folder)
+        check_room(size, int(np.count_nonzero(mask)), len(indices), self.files.folder)
         return mask
+
+    def camera(self) -> Float64Array | None:
+        matrix = self.camera_matrix
+        return None if matrix is None else self.window.camera(matrix)
+
+    def has_8_bits(self, indices: Sequence[int]) -> bool:
+        return any((self.facts[index].stated_size or ((), 0))[1] == 1 for index in indices)
+
+    def equal_images(self, indices: Sequence[int]) -> list[tuple[int, int]]:
+        images = [self.files.images[index] for index in indices]
+        if page_of(images[0])[0] != images[0] or self.channels is not None:
+            return []
+        with reading(self.files.folder):
+            return equal_files(images)
+
+    def lamps_on_grid(self, mask: Bools, step: int) -> NearLamps | None:
+        if self.lamps is None or not self.lamps.used:
+            return None
+        return self.lamps.over(self, mask, step=step)
 
     def near_lamps(self, mask: Bools) -> tuple[NearLamps | None, list[CaptureWarning]]:
         """Return all near lamps over a mask (H, W), or None for distant lights, and warnings about
@@ -475,7 +418,7 @@ def capture_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
     return n_pixels * 4 * n_lights + max(images, n_pixels * BYTES_OF_RESULTS)
 
 
-def check_capture(largest: StoredSize, n_pixels: int, n_lights: int, folder: Path) -> None:
+def check_room(largest: StoredSize, n_pixels: int, n_lights: int, folder: Path) -> None:
     """Raise InputError if a capture needs more memory than is available; see capture_bytes."""
     height, width = largest[0][:2]
     check_memory(

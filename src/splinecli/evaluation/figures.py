@@ -28,6 +28,7 @@ from splinecli.evaluation.run import read_first_draw
 from splinecli.evaluation.tables import AVERAGE, trial_averages
 from splinecli.maths import Float32Array, Floats
 from splinecli.pictures.plots import method_maps, method_styles, observation_map_figure, png_bytes
+from splinecli.recipe.steps import follow
 from splinecli.records.documents import Likeness, RelightingReport
 from splinecli.results.map_values import agreeing_lights
 from splinecli.results.material import material_of
@@ -259,9 +260,7 @@ def capture_figures(
     )
     # Under near lamps, or with a near camera, each pixel has its own light directions.
     if network is not None and capture.lamps is None and capture.camera_matrix is None:
-        whole = (
-            stored.capture if protocol.as_stored else stored.restore(stored.estimate_intensities())
-        )
+        whole = follow(replace(stored, options=protocol.recipe), "intensities", "saturation").made
         png = _observation_maps(
             whole, capture, network, errors_deg[network.name], pixels, title=title
         )
@@ -346,7 +345,7 @@ def relight_first_draw(
     from splinecli.materials.maps import lights_that_reach, render_gray
 
     stored, given = read_first_draw(folder, name, protocol, advance)
-    whole = stored.capture
+    whole = stored.made
     held = [
         place for place, light in enumerate(whole.light_indices) if light not in given.light_indices
     ]

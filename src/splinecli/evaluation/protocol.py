@@ -17,6 +17,7 @@ from splinecli.errors import InputError, UsageError
 from splinecli.lights.draws import Draw, check_draw_settings
 from splinecli.maths import Float64Array
 from splinecli.maths.robust import MIN_LIGHTS
+from splinecli.recipe.work import RecipeOptions
 from splinecli.records.documents import SkippedCapture
 
 # Of the seeds: noise and choice of pixels are independent of each other and of the draws
@@ -142,6 +143,18 @@ class Protocol:
     def skipped_lights(self, capture: str) -> int:
         """Return the number of lights that are skipped at the start of a capture."""
         return self.skip_first.get(capture, self.skip_first.get(EVERY_CAPTURE, 0))
+
+    @property
+    def recipe(self) -> RecipeOptions:
+        """How the recipe prepares the capture of a trial, whose lights need no checks."""
+        return RecipeOptions(
+            as_stored=self.as_stored,
+            finds_lights=self.finds_lights,
+            refuses_lights=False,
+            judges=False,
+            refine_lights=self.light_error_deg is not None,
+            light_error_deg=self.light_error_deg,
+        )
 
 
 def lights_value(protocol: Protocol) -> int | Literal["all"]:

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 from splinecli._version import __version__
 from splinecli.capture import Capture, CaptureSource, capture_name, open_capture
 from splinecli.capture.files import digest
-from splinecli.capture.record import StoredCapture
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.estimate.methods import Estimator
 from splinecli.evaluation.protocol import (
@@ -41,6 +40,8 @@ from splinecli.evaluation.trials import (
 from splinecli.lights.draws import Draw, draw_lights
 from splinecli.lights.light_fit import check_distant
 from splinecli.maths.robust import MIN_LIGHTS
+from splinecli.recipe.steps import begin, follow
+from splinecli.recipe.work import RecipeOptions, Work
 from splinecli.records.documents import SkippedCapture
 
 
@@ -238,7 +239,7 @@ def read_first_draw(
     name: str,
     protocol: Protocol,
     progress: Callable[[float], object] = lambda share: None,
-) -> tuple[StoredCapture, Capture]:
+) -> tuple[Work, Capture]:
     """Return a capture under all lights that are not skipped, and under the protocol's first draw.
 
     `progress` is called with the fraction of the images just read. Raises InputError or UsageError
@@ -248,8 +249,10 @@ def read_first_draw(
     protocol, draws_file = read_draws_file(protocol)
     trial = Trial(name, "", 0, draws_for(source, name, protocol, draws_file)[0], protocol, "")
     lights = range(protocol.skipped_lights(name), source.n_lights)
-    stored = source.read_stored(
-        lights, lambda: progress(1 / len(lights)), as_stored=protocol.as_stored
+    stored = follow(
+        begin(source, lights, RecipeOptions(as_stored=protocol.as_stored)),
+        last="observations",
+        advance=lambda *_: progress(1 / len(lights)),
     )
     return stored, TrialSource(stored).see(trial)
 

@@ -8,7 +8,6 @@ import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import count
 from pathlib import Path
 from threading import Lock
@@ -20,7 +19,7 @@ from msgspec import json as msgspec_json
 from numpy.typing import NDArray
 
 from splinecli.capture import Capture, CaptureSource, open_capture
-from splinecli.capture.record import StoredCapture, in_one_plane
+from splinecli.capture.record import in_one_plane
 from splinecli.errors import InputError
 from splinecli.estimate.inference import estimate_normals, find_surface
 from splinecli.estimate.methods import Estimator
@@ -28,9 +27,9 @@ from splinecli.evaluation.protocol import NOISE_STREAM, PIXELS_STREAM, Protocol
 from splinecli.judge.odd_images import check_ground_truth
 from splinecli.judge.summary import sample_observations
 from splinecli.lights.draws import Draw
-from splinecli.lights.light_fit import refine_capture
-from splinecli.lights.unknown_lights import find_lights
 from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.recipe.steps import begin, follow
+from splinecli.recipe.work import RecipeOptions, Work
 from splinecli.records.capture_warnings import GROUND_TRUTH_UPSIDE_DOWN
 from splinecli.system.files import as_splinecli_error, refusals_as_output_errors, write_text
 from splinecli.system.progress import Progress, ignore
@@ -164,7 +163,7 @@ class TrialSource:
     observations to score; None for all rows.
     """
 
-    stored: StoredCapture
+    stored: Work
     rows: NDArray[np.integer] | None = None
 
     def see(self, trial: Trial, *, whole: bool = False) -> Capture:
@@ -175,27 +174,17 @@ class TrialSource:
         refined or estimated from all pixels.
         """
         protocol, pixels = trial.protocol, None if whole else self.rows
-        seen = self.stored.choose_lights(self.places(trial.lights))
+        work = self.stored.choose_images(self.places(trial.lights))
         if protocol.light_noise_deg:
-            seen = replace(seen, capture=_with_noise(seen.capture, trial))
-        if protocol.finds_lights:
-            seen = seen.find_lights(partial(find_lights, refuse=False))
+            work = replace(work, capture=_with_noise(work.made, trial))
+        work = replace(work, options=protocol.recipe)
         # The intensities are estimated from all pixels, so this happens before the scored pixels
         # are chosen.
-        intensities = None if protocol.as_stored else seen.estimate_intensities()
-        needs_all = (
-            protocol.finds_lights
-            or protocol.light_error_deg is not None
-            or seen.capture.lamps is not None
-        )
-        if pixels is not None and not needs_all:
-            seen, pixels = seen.choose_pixels(pixels), None
-        capture = seen.capture if protocol.as_stored else seen.restore(intensities)
-        if protocol.light_error_deg is not None:
-            known = self.stored.intensities_known
-            capture = refine_capture(
-                capture, error_deg=protocol.light_error_deg, intensities_known=known
-            )
+        work = follow(work, "lights", "intensities")
+        needs_all = work.options.finds_lights or work.options.refine_lights
+        if pixels is not None and not needs_all and work.made.lamps is None:
+            work, pixels = work.choose_pixels(pixels), None
+        capture = follow(work, "saturation", "refinement").made
         if pixels is None:
             return capture
         # Near lamps require the surface, which can only be computed from all pixels together.
@@ -203,7 +192,7 @@ class TrialSource:
 
     def places(self, lights: Sequence[int]) -> list[int]:
         """Return the positions of lights among the lights that were read."""
-        place = {light: place for place, light in enumerate(self.stored.capture.light_indices)}
+        place = {light: place for place, light in enumerate(self.stored.made.light_indices)}
         return [place[light] for light in lights]
 
 
@@ -242,7 +231,7 @@ class SharedDraw:
             mae_deg = float(estimate.error_map_deg[capture.mask][source.rows].mean())
         light_error_deg = None
         if capture.light_errors_deg is not None:
-            true = source.stored.capture.light_directions[source.places(trial.lights)]
+            true = source.stored.made.light_directions[source.places(trial.lights)]
             light_error_deg = float(angle_between_deg(capture.light_directions, true).mean())
         return Score(
             mae_deg, estimate.seconds, capture.estimated_intensities is not None, light_error_deg
@@ -303,28 +292,27 @@ class CaptureReading:
         """Return the capture under all lights, and the notes on it, by protocol. Raises InputError,
         UsageError.
         """
-        numbers, as_stored = count(1), all(protocol.as_stored for protocol in self.protocols)
+        numbers, n_images = count(1), len(self.lights)
+        as_stored = all(protocol.as_stored for protocol in self.protocols)
         try:
-            stored = source.read_stored(
-                self.lights, lambda: on_image(next(numbers), len(self.lights)), as_stored=as_stored
+            stored = follow(
+                begin(source, self.lights, RecipeOptions(as_stored=as_stored)),
+                last="observations",
+                advance=lambda *_: on_image(next(numbers), n_images),
             )
         except OSError as error:
             raise as_splinecli_error(error, self.folder) from error
-        first = self.protocols[0]
-        pixels = scored_rows(stored.capture, max_pixels=first.max_pixels, seed=first.seed)
-        if len(pixels) == stored.capture.n_pixels:
+        first, capture = self.protocols[0], stored.made
+        pixels = scored_rows(capture, max_pixels=first.max_pixels, seed=first.seed)
+        if len(pixels) == capture.n_pixels:
             trials = TrialSource(stored)
-        elif (
-            self.whole
-            or stored.capture.lamps is not None
-            or not (as_stored or stored.intensities_known)
-        ):
+        elif self.whole or capture.lamps is not None or not (as_stored or source.intensities_known):
             # `infer` estimates unknown intensities from all pixels, and near lamps require the
             # whole surface.
             trials = TrialSource(stored, pixels)
         else:
             trials = TrialSource(stored.choose_pixels(pixels))
-        notes = [_notes(stored.capture, self.name, protocol) for protocol in self.protocols]
+        notes = [_notes(capture, self.name, protocol) for protocol in self.protocols]
         return trials, notes
 
 

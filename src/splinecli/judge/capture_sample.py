@@ -11,20 +11,20 @@ from pathlib import Path
 
 import numpy as np
 
-from splinecli.capture import CaptureSource
-from splinecli.capture.formats.decoders import page_of
+from splinecli.capture import Capture
 from splinecli.capture.light_rows import USUAL_FRAME, LightFrame
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.sample import Sample
+from splinecli.capture.source import Source
 from splinecli.judge.light_check import LightCheck, check_lights
 from splinecli.judge.odd_images import ImageShift, find_shifts
 from splinecli.judge.readings import Doubt, Kind, Readings
 from splinecli.judge.shading_shifts import moved_back, shading_shifts
+from splinecli.judge.summary import closeup_of, sample_observations
 from splinecli.lights.light_fit import Factors, find_factors
 from splinecli.lights.rough_normals import median_turn_deg
 from splinecli.maths import Float64Array, Floats
 from splinecli.maths.robust import solve_each
-from splinecli.system.files import equal_files, reading
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,48 +59,37 @@ class CaptureSample:
     background: float = 0.0  # the share of dark background that was left out of the sample
 
     @classmethod
-    def of_source(
-        cls,
-        source: CaptureSource,
-        samples: tuple[Sample, Sample],
-        indices: Sequence[int],
-        *,
-        truth: Floats | None = None,
-        strict: bool = False,
-    ) -> CaptureSample:
-        """Return the checks' input for the images with these indices, from the capture's files,
-        sample and closeup.
-        """
-        (sample, closeup), lamps, measured = samples, source.lamps, source.intensities_measured
-        images = [source.files.images[index] for index in indices]
-        with reading(source.files.folder):
-            single = page_of(images[0])[0] == images[0] and source.channels is None
-            copies = equal_files(images) if single else []
+    def of(cls, source: Source, capture: Capture, *, strict: bool = False) -> CaptureSample:
+        """Return the checks' input for a capture that was prepared from this source."""
+        indices, measured = capture.light_indices, source.intensities_measured
+        sample = sample_observations(capture.observations, capture.mask)
+        if capture.estimated_intensities is not None:
+            # They were estimated under the lights that are in question.
+            stored = sample.observations * capture.estimated_intensities
+            sample = replace(sample, observations=stored)
+        closeup = closeup_of(capture.mask)
         return cls(
             source.image_names(indices),
             source.light_directions,
             indices,
             sample,
-            closeup,
+            sample_observations(capture.observations, capture.mask, closeup),
             measured,
             intensities=gray_intensities(source.light_intensities[list(indices)])
             if measured
             else None,
-            eight_bit=any(
-                (source.facts[index].stated_size or ((), 0))[1] == 1 for index in indices
-            ),
-            lamps=lamps.over(source, sample.mask, step=sample.step)
-            if lamps is not None and lamps.used
-            else None,
-            has_positions=lamps is not None,
-            found=source.find_lights is not None,
-            origin=source.files.light_directions or Path("light_directions"),
+            estimated=capture.estimated_intensities,
+            eight_bit=source.has_8_bits(indices),
+            lamps=source.lamps_on_grid(sample.mask, sample.step),
+            has_positions=source.has_positions,
+            found=capture.light_errors_deg is not None,
+            origin=source.lights_file,
             frame=source.light_frame,
-            linear=source.radiometry.curve == 1,
-            truth=truth,
+            linear=source.is_linear,
+            truth=capture.ground_truth,
             strict=strict,
-            in_channels=source.channels is not None,
-            copies=copies,
+            in_channels=source.in_channels,
+            copies=source.equal_images(indices),
         )
 
     @cached_property

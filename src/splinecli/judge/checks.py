@@ -4,18 +4,19 @@ their order.
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from splinecli.capture import Capture, CaptureSource
-from splinecli.capture.sample import Sample
+from splinecli.capture import Capture
+from splinecli.capture.source import Source
 from splinecli.errors import InputError
 from splinecli.images.lamps import estimate_light_intensities
-from splinecli.judge.capture_sample import CaptureSample, gray_intensities
+from splinecli.judge.capture_sample import CaptureSample
 from splinecli.judge.light_check import LightCheck, light_warnings
 from splinecli.judge.odd_images import check_ground_truth
 from splinecli.judge.readings import LIKELY, SRGB_EXPONENT, Kind, Reading
-from splinecli.judge.summary import closeup_of, leave_out_background, sample_observations
+from splinecli.judge.summary import leave_out_background
 from splinecli.lights.light_fit import would_refine
 from splinecli.lights.rough_normals import median_turn_deg
 from splinecli.maths import Float64Array, Floats
@@ -326,54 +327,28 @@ CHECKS = [
 ]
 
 
-def check_capture(
-    source: CaptureSource, capture: Capture, *, strict: bool = False
-) -> list[CaptureWarning]:
-    """Return warnings about a capture that was read from this source; see check_sample.
+class Judgement(NamedTuple):
+    """What the checks found."""
+
+    warnings: tuple[CaptureWarning, ...]
+    light_check: LightCheck | None  # None if the lights were estimated from the images
+
+
+def check_capture(source: Source, capture: Capture, *, strict: bool = False) -> Judgement:
+    """Check the lights and images of a capture that was prepared from this source.
+
+    With `strict`, properties that the images leave undetermined are warnings, too.
 
     Examples:
         >>> from splinecli.capture import open_capture
         >>> from splinecli.judge.checks import check_capture
+        >>> from splinecli.recipe import prepare_capture
         >>> source = open_capture("examples/medallion")
-        >>> [warning.code for warning in check_capture(source, source.read())]
-        []
+        >>> check_capture(source, prepare_capture(source)).warnings
+        ()
     """
-    samples, truth = _samples(capture), capture.ground_truth
-    seen = CaptureSample.of_source(
-        source, samples, capture.light_indices, truth=truth, strict=strict
-    )
-    return check_sample(replace(seen, estimated=capture.estimated_intensities))[1]
-
-
-def check_arrays(capture: Capture, *, intensities: Floats | None = None) -> list[CaptureWarning]:
-    """Return warnings about a capture that was made from arrays; see check_sample.
-
-    Args:
-        intensities: (F,) or (F, 3), those that were given; None for none.
-    """
-    (sample, closeup), lamps, n_lights = _samples(capture), capture.lamps, capture.n_lights
-    seen = CaptureSample(
-        [f"images[{index}]" for index in range(n_lights)],
-        capture.light_directions,
-        range(n_lights),
-        sample,
-        closeup,
-        intensities is not None,
-        intensities=None if intensities is None else gray_intensities(intensities),
-        estimated=capture.estimated_intensities,
-        lamps=None if lamps is None else lamps.within(0, 0, sample.step, lamps.camera_matrix),
-        has_positions=lamps is not None,
-        found=capture.light_errors_deg is not None,
-    )
-    return check_sample(seen)[1]
-
-
-def _samples(capture: Capture) -> tuple[Sample, Sample]:
-    sample = sample_observations(capture.observations, capture.mask)
-    if capture.estimated_intensities is not None:
-        # They were estimated under the lights that are in question.
-        sample = replace(sample, observations=sample.observations * capture.estimated_intensities)
-    return sample, sample_observations(capture.observations, capture.mask, closeup_of(capture.mask))
+    light_check, warnings = check_sample(CaptureSample.of(source, capture, strict=strict))
+    return Judgement(tuple(warnings), light_check)
 
 
 def check_sample(seen: CaptureSample) -> tuple[LightCheck | None, list[CaptureWarning]]:

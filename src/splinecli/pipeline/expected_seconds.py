@@ -47,6 +47,7 @@ def expected_seconds(
     n_images: int,
     image_pixels: int,
     *,
+    n_reads: int | None = None,
     network: bool = True,
     distils: bool | None = None,
     align: bool = False,
@@ -57,9 +58,10 @@ def expected_seconds(
     Args:
         n_pixels: number of pixels of the mask.
         image_pixels: number of pixels of each image.
+        n_reads: number of images that are read, counting an image again each time; None for once.
         network: whether the method is spline-net, and not a fit.
         distils: whether a distilled estimator is used. None decides by AUTOMATIC_FROM.
-        align: whether the images are aligned, for which they are read twice.
+        align: whether the images are aligned.
         maps: the maps that are also written.
     """
     cores = min(count_available_cores(), 8)
@@ -67,11 +69,10 @@ def expected_seconds(
     read = costs.read * image_pixels * n_images / min(cores, 2)
     pictures = read * any(row.reads_images for row in maps)
     pictures += sum(row.seconds + row.seconds_per_pixel * n_pixels for row in maps)
-    found = {"read": read, "check": 1.5, "write": costs.write * n_pixels, "pictures": pictures}
+    reads = costs.read * image_pixels * (n_reads or n_images) / min(cores, 2)
+    found = {"read": reads, "check": 1.5, "write": costs.write * n_pixels, "pictures": pictures}
     if align:
-        found["read"] += (
-            read + _ALIGN + _ALIGN_ROOT * min(n_images * image_pixels, MOST_VALUES) ** 0.5
-        )
+        found["read"] += _ALIGN + _ALIGN_ROOT * min(n_images * image_pixels, MOST_VALUES) ** 0.5
     if not network:
         return {**found, "estimate": _OTHER_METHODS * n_pixels / cores}
     if n_pixels >= AUTOMATIC_FROM if distils is None else distils:

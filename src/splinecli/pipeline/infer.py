@@ -26,14 +26,15 @@ from splinecli.errors import OutputError, SplinecliError, UsageError
 from splinecli.estimate.inference import NormalEstimate, estimate_normals, find_surface, lighting_on
 from splinecli.estimate.methods import DEFAULT_METHOD, Estimator, MethodOptions, make_estimator
 from splinecli.estimate.methods.estimator import FEWEST_PIXELS, student_sizes
-from splinecli.judge.checks import check_capture, check_confidence, refuse_if_strict
+from splinecli.judge.checks import check_confidence, refuse_if_strict
 from splinecli.lights.draws import draw_lights
-from splinecli.lights.light_fit import refine_capture
 from splinecli.pictures.maps import encode_png
 from splinecli.pictures.plots import sky_plot
 from splinecli.pipeline.expected_seconds import AUTOMATIC_FROM, expected_seconds
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.integrate import view_of_report
+from splinecli.recipe.steps import begin, follow, images_to_read
+from splinecli.recipe.work import Work
 from splinecli.records.capture_warnings import (
     EIGHT_BIT,
     NOT_DISTILLED,
@@ -160,34 +161,31 @@ def distil_for(
 
 
 def estimate_capture(
-    capture: Capture,
+    work: Work,
     load: Callable[[], Estimator],
-    check: Callable[[Capture], list[CaptureWarning]],
     *,
-    refine_lights: Callable[[Capture], Capture] | None = None,
     distil: bool | None = None,
-    strict: bool = False,
     progress: Callable[[int], object] | None = None,
     clock: Clock | None = None,
 ) -> tuple[NormalEstimate, DistilledEstimator | None]:
-    """Return the normals of a capture, with all warnings added to it, and the distilled estimator
-    if one was used.
+    """Return the normals of a prepared capture, with all warnings added to it, and the distilled
+    estimator if one was used.
 
-    The capture already contains the warnings from reading it. `check` returns the warnings about
-    its lights and images (diagnosis/checks.py), then `load` the estimator, and `refine_lights` the
-    capture with refined lights. `distil` is as in distil_for. `progress` is called with the number
-    of pixels just estimated. With `strict`, a warning that an input is probably wrong becomes an
-    InputError. The clock times the stages and shows them.
+    The capture is judged first, then `load` returns the estimator. `distil` is as in distil_for.
+    `progress` is called with the number of pixels just estimated. If the options of the recipe are
+    strict, a warning that an input is probably wrong becomes an InputError. The clock times the
+    stages and shows them.
     """
     clock = clock or Clock()
     clock.begin("check", note="checking")
-    warnings = [*capture.warnings, *check(capture)]
-    refuse_if_strict(warnings, capture.name, strict=strict)
-    if refine_lights is not None:
-        before = len(capture.warnings)
-        capture = refine_lights(capture)
-        warnings = [warning for warning in warnings if warning.kind != ROUGH_LIGHTS]
-        warnings += capture.warnings[before:]
+    strict, prepared = work.options.strict, work.made.warnings
+    work = follow(work, "judgement", "judgement")
+    judged = work.judgement.warnings if work.judgement else ()
+    refuse_if_strict([*prepared, *judged], work.made.name, strict=strict)
+    capture = follow(work, "refinement", "refinement").made
+    if work.options.refine_lights:
+        judged = tuple(warning for warning in judged if warning.kind != ROUGH_LIGHTS)
+    warnings = [*prepared, *judged, *capture.warnings[len(prepared) :]]
     capture = replace(capture, warnings=tuple(warnings))
     capture = find_surface(capture)
     estimator = load()
@@ -236,9 +234,8 @@ def infer_capture(
         >>> from pathlib import Path
         >>> from splinecli.pipeline.infer import infer_capture
         >>> from splinecli.pipeline.infer_options import InferOptions
-        >>> report = infer_capture(Path("examples/medallion"), InferOptions(method="ls",
-        output="results"))
-        >>> report["n_pixels"]
+        >>> options = InferOptions(method="ls", output="results")
+        >>> infer_capture(Path("examples/medallion"), options)["n_pixels"]
         11836
     """
     name = capture_name(folder)
@@ -247,18 +244,10 @@ def infer_capture(
         if options.finds_lights:
             _check_light_files(target)
         load = load or cache(partial(make_method, options))
-        source, capture = _read(folder, options, clock)
+        work = _prepare(folder, options, clock)
+        source, capture = work.files, work.made
         _check_results(capture, folder, options)
-        refine = partial(refine_capture, intensities_known=source.intensities_known)
-        estimate, distilled = estimate_capture(
-            capture,
-            load,
-            partial(check_capture, source, strict=options.strict),
-            refine_lights=refine if options.refine_lights else None,
-            distil=options.distil,
-            strict=options.strict,
-            clock=clock,
-        )
+        estimate, distilled = estimate_capture(work, load, distil=options.distil, clock=clock)
         for warning in estimate.capture.warnings:
             # usual in a batch, and of all its captures
             once = warning.code if warning.kind is EIGHT_BIT else None
@@ -336,52 +325,30 @@ def loads_first(options: InferOptions) -> bool:
     return chosen or options.method != DEFAULT_METHOD or options.finds_lights
 
 
-def _read(folder: Path, options: InferOptions, clock: Clock) -> tuple[CaptureSource, Capture]:
+def _prepare(folder: Path, options: InferOptions, clock: Clock) -> Work:
+    """Return the capture of a folder, prepared but not judged."""
     source = options.open(folder)
     indices = source.places_of(options.light_indices)
     if options.n_lights is not None:
-        indices = draw_lights(
-            source.light_directions, options.n_lights, trials=1, seed=options.seed
-        )[0]
-    count = source.n_lights if indices is None else len(indices)
+        directions = source.light_directions
+        indices = draw_lights(directions, options.n_lights, trials=1, seed=options.seed)[0]
+    work = begin(source, indices, options.recipe)
     height, width, *_ = source.facts[0].size[0]
-    maps = chosen_maps(options.maps, page=options.html)
+    n_reads = images_to_read(work)
     seconds = partial(
         expected_seconds,
-        n_images=count,
+        n_images=len(work.indices),
+        n_reads=n_reads,
         image_pixels=height * width,
         network=options.method.startswith(DEFAULT_METHOD),
         align=options.align,
-        maps=maps,
+        maps=chosen_maps(options.maps, page=options.html),
     )
     clock.expect(seconds(height * width, distils=options.distil))
-    # images that are read to find the object, also after aligning
-    for_mask = source.n_lights * options.auto_mask
-    advance = clock.begin("read", (count + for_mask) * (1 + options.align), "reading")
-    if options.auto_mask:
-        source = source.find_mask(lambda: advance(1, "finding the object"))
-    if options.align:
-        source = align(source, indices, lambda: advance(1, "aligning"))
-    capture = source.read(indices, progress=lambda: advance(1), as_stored=options.as_stored)
-    rest = seconds(capture.n_pixels, distils=options.distil)
+    work = follow(work, last="saturation", advance=clock.begin("read", n_reads, "reading"))
+    rest = seconds(work.made.n_pixels, distils=options.distil)
     clock.expect({stage: rest[stage] for stage in rest if stage != "read"})
-    return source, capture
-
-
-def align(
-    source: CaptureSource,
-    indices: Sequence[int] | None,
-    progress: Callable[[], object] = lambda: None,
-) -> CaptureSource:
-    """Return the capture with its images aligned, and then with a new automatic mask if it had
-    one.
-    """
-    aligned = source.align(indices, progress)
-    return (
-        aligned
-        if source.automatic_mask is None
-        else replace(aligned, automatic_mask=None).find_mask(progress)
-    )
+    return work
 
 
 def _check_results(capture: Capture, folder: Path, options: InferOptions) -> None:

@@ -5,6 +5,7 @@ to JSON.
 # The options form a table: name, type, panel and kind of value, then the help text.
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import re
@@ -26,7 +27,6 @@ from splinecli.capture.reader import EQUAL
 from splinecli.capture.record import (
     ESTIMATE,
     SIDES_DEG,
-    LightFinder,
     azimuth_of,
     check_light_indices,
 )
@@ -36,6 +36,7 @@ from splinecli.images.alignment import MIN_IMAGES
 from splinecli.maths.normals import Convention
 from splinecli.maths.robust import MIN_LIGHTS
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
+from splinecli.recipe.work import RecipeOptions
 from splinecli.records import base as records
 from splinecli.records.base import FileName, NotNegative, Option, Positive, Record, Seed
 from splinecli.records.output_files import MAPS, NORMALS
@@ -477,14 +478,18 @@ class Reading(Record, frozen=True, kw_only=True):
             parse_transfer(self.transfer), dark, flats, self.transfer == AUTOMATIC
         )
 
+    @property
+    def recipe(self) -> RecipeOptions:
+        """How the recipe prepares the capture."""
+        return RecipeOptions(
+            align=self.align,
+            finds_lights=self.finds_lights,
+            first_light=self.first_light,
+            strict=self.strict,
+        )
+
     def open(self, folder: Path) -> CaptureSource:
         """Open the capture in the folder with these options. Raises InputError."""
-        find: LightFinder | None = None
-        if self.finds_lights:
-            from splinecli.lights.unknown_lights import find_lights
-
-            find = partial(find_lights, first_light=self.first_light)
-
         return open_capture(
             folder,
             lights=self.light_file,
@@ -497,7 +502,7 @@ class Reading(Record, frozen=True, kw_only=True):
             lights_format=self.light_format,
             lamps=self.lamps,
             window=parse_window(self.crop, self.scale),
-            find_lights=find,
+            needs_lights=not self.finds_lights,
             lights_in_channels=self.lights_in_channels,
             crosstalk=self.crosstalk,
         )
@@ -675,6 +680,15 @@ class InferOptions(Reading, frozen=True, kw_only=True):
             dict.fromkeys(
                 records.long_name(name, of) if of else "--maps" for name, of in options.items()
             )
+        )
+
+    @property
+    def recipe(self) -> RecipeOptions:
+        return dataclasses.replace(
+            super().recipe,
+            as_stored=self.as_stored,
+            auto_mask=self.auto_mask,
+            refine_lights=self.refine_lights,
         )
 
     @property

@@ -7,22 +7,19 @@ from typing import Any
 
 import numpy as np
 
+from splinecli.capture import CaptureSource
 from splinecli.capture.channel_lights import CHANNELS
-from splinecli.capture.formats.images import common_size
 from splinecli.capture.light_files import check_writable, encode_lights
-from splinecli.capture.record import FoundLights
-from splinecli.errors import InputError, UsageError
-from splinecli.judge.capture_sample import CaptureSample
-from splinecli.judge.checks import check_sample
+from splinecli.errors import UsageError
 from splinecli.judge.light_check import candidate_rows
-from splinecli.judge.summary import CaptureSummary, summarise_capture
 from splinecli.lights.calibration.balls import find_view
 from splinecli.pictures.plots import sky_plot
 from splinecli.pipeline.expected_seconds import expected_seconds
 from splinecli.pipeline.incoming import unpacked
-from splinecli.pipeline.infer import BASE_BYTES, align, infer_bytes
+from splinecli.pipeline.infer import BASE_BYTES, infer_bytes
 from splinecli.pipeline.infer_options import InfoOptions, Reading
-from splinecli.records.capture_warnings import estimated_lights
+from splinecli.recipe.steps import begin, follow, images_to_read
+from splinecli.recipe.work import Work
 from splinecli.system.files import check_free, write_bytes
 from splinecli.system.progress import SILENT, Observer
 
@@ -56,56 +53,23 @@ def describe_capture(
                 hint="Leave one out",
             )
     with TemporaryDirectory() as frames:  # extracted from a film
-        source = reading.open(
-            unpacked(options.capture, Path(frames), reading, observer, redo="all")
-        )
-        common_size(source.facts)  # as in `infer`
-        if options.auto_mask:
-            with observer.progress("finding the object", source.n_lights) as advance:
-                source = source.find_mask(lambda: advance(1))
-        if reading.align:
-            with observer.progress("aligning", source.n_lights) as advance:
-                source = align(source, None, lambda: advance(1))
+        folder = unpacked(options.capture, Path(frames), reading, observer, redo="all")
+        source = reading.open(folder)
+        _check_outputs(options, source)
+        work = begin(source, None, replace(reading.recipe, auto_mask=options.auto_mask))
+        with observer.progress("reading", images_to_read(work)) as advance:
+            work = follow(work, advance=lambda amount, _: advance(amount))
+        capture, judgement = work.made, work.judgement
+        assert judgement is not None  # the recipe judges
         if plot is not None:
-            if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
-                problem = (
-                    f"the plot {plot} would be in the folder of the images and be read as an image"
-                    " of the capture"
-                )
-                raise UsageError(problem, hint="Choose another folder for it")
-            check_free(plot.parent, [plot.name], overwrite=options.overwrite)
-        if mended_lights is not None:
-            check_writable(mended_lights)
-            if source.lamps is not None and source.lamps.used:
-                raise UsageError("--mended-lights writes directions, but the lights are near lamps")
-            check_free(mended_lights.parent, [mended_lights.name], overwrite=options.overwrite)
-        with observer.progress("reading", len(source.files.images)) as advance:
-            summary = summarise_capture(source, progress=lambda: advance(1))
-        summary, found_lights = _with_found_lights(summary)
-        source = summary.source
-        if plot is not None and source.find_lights is not None and found_lights is None:
-            raise InputError(
-                "the images differ in size, so there are no lights to plot",
-                path=source.files.folder,
-            )
-        if plot is not None:
-            errors_deg = None if found_lights is None else found_lights.errors_deg
-            write_bytes(
-                plot, sky_plot(source.light_directions, source.files.name, errors_deg=errors_deg)
-            )
-        check, warnings = None, summary.warnings()
-        if summary.samples is not None:
-            seen = CaptureSample.of_source(
-                source, summary.samples, range(source.n_lights), strict=reading.strict
-            )
-            check, found = check_sample(seen)
-            warnings += found
-        if found_lights is not None:
-            warnings.append(estimated_lights(found_lights.errors_deg))
+            errors_deg = capture.light_errors_deg
+            picture = sky_plot(capture.light_directions, capture.name, errors_deg=errors_deg)
+            write_bytes(plot, picture)
+        check, warnings = judgement.light_check, [*capture.warnings, *judgement.warnings]
         for warning in warnings:
             observer.warn(str(warning))
         report = {
-            **_report(summary, found_lights),
+            **_report(work),
             "warnings": [str(warning) for warning in warnings],
             "warning_codes": [warning.code for warning in warnings],
         }
@@ -130,16 +94,14 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         for kind in report["image_kinds"]
     )
     estimated = report["estimated_lights"]
-    lights = "not estimated, because the images differ in size"
-    if report["axis_angle_deg"] is not None:
-        nearest, farthest = report["axis_angle_deg"]
-        lights = report["light_directions"] or "estimated from the images"
-        angles = (
-            f"{nearest:.0f} to {farthest:.0f}"
-            if f"{nearest:.0f}" != f"{farthest:.0f}"
-            else f"{nearest:.0f}"
-        )
-        lights += f", {angles} degrees from the camera axis"
+    nearest, farthest = report["axis_angle_deg"]
+    lights = report["light_directions"] or "estimated from the images"
+    angles = (
+        f"{nearest:.0f} to {farthest:.0f}"
+        if f"{nearest:.0f}" != f"{farthest:.0f}"
+        else f"{nearest:.0f}"
+    )
+    lights += f", {angles} degrees from the camera axis"
     intensities = (
         report["light_intensities"] or "none: equal, or estimated where equal ones do not fit"
     )
@@ -218,37 +180,51 @@ def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
     ]
 
 
-def _with_found_lights(summary: CaptureSummary) -> tuple[CaptureSummary, FoundLights | None]:
-    """Return the summary with the lights estimated from its sample, and these lights; None if files
-    provide them.
-    """
-    source = summary.source
-    if source.find_lights is None or summary.samples is None:
-        return summary, None
-    sample, _ = summary.samples
-    try:
-        found = source.find_lights(sample.observations, sample.mask, source.intensities_known)
-    except InputError as error:
-        raise InputError(error.problem, path=source.files.folder, hint=error.hint) from None
-    return replace(summary, source=replace(source, light_directions=found.directions)), found
+def _check_outputs(options: InfoOptions, source: CaptureSource) -> None:
+    """Raise UsageError or OutputError, before the images are read, if a file cannot be written."""
+    plot, mended_lights = options.plot, options.mended_lights
+    if plot is not None:
+        if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
+            problem = (
+                f"the plot {plot} would be in the folder of the images and be read as an image of"
+                " the capture"
+            )
+            raise UsageError(problem, hint="Choose another folder for it")
+        check_free(plot.parent, [plot.name], overwrite=options.overwrite)
+    if mended_lights is not None:
+        check_writable(mended_lights)
+        if source.lamps is not None and source.lamps.used:
+            raise UsageError("--mended-lights writes directions, but the lights are near lamps")
+        check_free(mended_lights.parent, [mended_lights.name], overwrite=options.overwrite)
 
 
-def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any]:
-    source, files, level = summary.source, summary.source.files, summary.white_level
+def _report(work: Work) -> dict[str, Any]:
+    source, capture, images = work.files, work.made, work.images
+    files, level = source.files, capture.white_level
+    height, width = work.shape
     channels = None if source.channels is None else CHANNELS
-    kinds = sorted(
-        {(*image.shape[1::-1], channels or image.shape[2], image.dtype) for image in summary.images}
-    )
-    angles, bright = summary.axis_angles_deg, [image.bright for image in summary.images]
+    kinds = sorted({(channels or image.channels, image.dtype) for image in images})
+    angles = np.degrees(np.arccos(capture.light_directions[:, 2].clip(-1, 1)))
+    bright = [image.bright for image in images]
     intensities, view = files.light_intensities, find_view(source.facts[0], None)
-    first = summary.images[0]
-    size = first.shape[0] * first.shape[1]
     stages = expected_seconds(
-        summary.n_pixels, len(summary.images), size, align=source.alignment is not None
+        capture.n_pixels,
+        len(images),
+        height * width,
+        n_reads=images_to_read(work),
+        align=work.options.align,
     )
     seconds = 3 + sum(stages.values())  # 3 to load the libraries and the network
-    largest = first.shape, np.dtype(first.dtype).itemsize
-    memory = BASE_BYTES + infer_bytes(largest, summary.n_pixels, source.n_lights)
+    largest = (height, width, images[0].channels), np.dtype(images[0].dtype).itemsize
+    memory = BASE_BYTES + infer_bytes(largest, capture.n_pixels, source.n_lights)
+    found = None
+    if capture.light_errors_deg is not None:
+        unequal = work.found_intensities
+        found = {
+            "directions": capture.light_directions.round(6).tolist(),
+            "errors_deg": capture.light_errors_deg.round(2).tolist(),
+            "intensities": None if unequal is None else unequal.round(4).tolist(),
+        }
 
     def text(path: Path | None) -> str | None:
         return None if path is None else str(path)
@@ -263,42 +239,32 @@ def _report(summary: CaptureSummary, found: FoundLights | None) -> dict[str, Any
         "capture": files.name,
         "layout": files.layout,
         # each is there for every channel that is a light
-        "images": len({image.path for image in summary.images}),
-        "first_image": first.path.name,
-        "last_image": summary.images[-1].path.name,
+        "images": len({image.path for image in images}),
+        "first_image": images[0].path.name,
+        "last_image": images[-1].path.name,
         "image_kinds": [
-            {"size": [w, h], "channels": count, "type": dtype} for w, h, count, dtype in kinds
+            {"size": [width, height], "channels": count, "type": dtype} for count, dtype in kinds
         ],
         "reads": source.window.in_words(),
-        "n_pixels": summary.n_pixels,
+        "n_pixels": capture.n_pixels,
         "light_directions": text(files.light_directions),
-        "estimated_lights": None
-        if found is None
-        else {
-            "directions": found.directions.round(6).tolist(),
-            "errors_deg": found.errors_deg.round(2).tolist(),
-            "intensities": None
-            if found.intensities is None
-            else found.intensities.round(4).tolist(),
-        },
+        "estimated_lights": found,
         "lamps": None if source.lamps is None else source.lamps.in_words(),
         "camera_matrix": None if source.camera_matrix is None else source.camera_matrix.tolist(),
         "exif_camera_matrix": view.matrix.round(1).tolist() if view.known else None,
         "light_intensities": text(intensities),
         "mask": text(files.mask) if source.automatic_mask is None else "found in the images",
         "ground_truth": text(files.ground_truth),
-        "axis_angle_deg": None
-        if source.find_lights is not None and found is None
-        else [round(float(angles.min()), 1), round(float(angles.max()), 1)],
+        "axis_angle_deg": [round(float(angles.min()), 1), round(float(angles.max()), 1)],
         "white_level": None if level is None else {"value": level.value, "origin": level.origin},
         "exposure": {
             "bright": [round(min(bright), 4), round(max(bright), 4)],
-            "saturated": round(max(image.saturated for image in summary.images), 4),
+            "saturated": round(max(image.saturated for image in images), 4),
         },
         "expect": {
             "memory_mib": round(memory / 2**20),
             "seconds": round(seconds),
             # 50,000 pixels per second: integration, mesh and their files on one core
-            "seconds_with_surface": round(seconds + summary.n_pixels / 50_000),
+            "seconds_with_surface": round(seconds + capture.n_pixels / 50_000),
         },
     }

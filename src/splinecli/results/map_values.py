@@ -141,8 +141,6 @@ def colours_of_surface(
     images = source.read_pixels(capture.mask, capture.light_indices, StoredPixels.colours, progress)
     for position, colours in enumerate(images):
         colours /= _shading(capture, normals, slice(None), [position])[1]
-        if capture.estimated_colours is not None:
-            colours /= capture.estimated_colours[position].astype(np.float32)
         if capture.estimated_intensities is not None:
             colours /= np.float32(capture.estimated_intensities[position])
         yield colours

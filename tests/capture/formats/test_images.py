@@ -17,7 +17,7 @@ from PIL import Image, ImageFile
 from PIL.TiffImagePlugin import IFDRational
 
 from scenes import ring_lights, with_chunk, write_capture
-from splinecli.capture import open_capture, read_capture, read_image, read_mask
+from splinecli.capture import open_capture, read_image, read_mask
 from splinecli.capture.formats.facts import (
     UPRIGHT,
     Exposure,
@@ -27,6 +27,7 @@ from splinecli.capture.formats.facts import (
 )
 from splinecli.capture.formats.images import decode_image
 from splinecli.errors import InputError
+from splinecli.recipe import read_capture
 from splinecli.records import capture_warnings
 
 RNG = np.random.default_rng(2)

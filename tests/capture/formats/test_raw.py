@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.capture import open_capture, read_capture
+from splinecli.capture import open_capture
 from splinecli.capture.formats.facts import Exposure, find_exposure, read_header
 from splinecli.capture.formats.images import decode_image
 from splinecli.errors import InputError
+from splinecli.recipe import read_capture
 
 WHITE = 16383
 BAYER = (0, 1, 1, 2)  # R G / G B

@@ -27,6 +27,7 @@ from splinecli.lights.calibration.balls import calibrate_ball, find_ball_files
 from splinecli.lights.calibration.lamps import measure_light_intensities
 from splinecli.pipeline.infer_options import InfoOptions
 from splinecli.pipeline.info import describe_capture
+from splinecli.recipe import RecipeOptions, prepare_capture
 
 HUGE = 30_000
 SMALL = (16, 18)
@@ -147,7 +148,7 @@ def test_images_of_another_size_than_others_are_not_decoded(tmp_path):
     write_claim(capture / "1.png", *SMALL)
     write_claim(capture / "3.png", 15_000, 15_000)
     with pytest.raises(InputError, match=f"3.png: found an image {sizes}"):
-        open_capture(capture).read()
+        prepare_capture(open_capture(capture))
 
 
 def test_a_capture_larger_than_the_memory_is_not_decoded(tmp_path, monkeypatch):
@@ -159,9 +160,9 @@ def test_a_capture_larger_than_the_memory_is_not_decoded(tmp_path, monkeypatch):
         write_claim(tmp_path / f"{number}.png", 19_000, 19_000)
     monkeypatch.setattr("splinecli.capture.formats.images.available_memory", lambda: 5e9)
     match = r"6 images of 19000 x 19000 pixels.* take 27\.4 GB of memory, but 5\.0 GB are available"
-    refused(lambda: open_capture(tmp_path).read(), match)
+    refused(lambda: prepare_capture(open_capture(tmp_path)), match)
     with pytest.raises(InputError, match="3 images of 19000 x 19000 pixels"):
-        open_capture(tmp_path).read([0, 1, 2])
+        prepare_capture(open_capture(tmp_path), [0, 1, 2])
 
 
 @pytest.mark.parametrize("size", [(754_974_744, 24), (2**31 - 1, 2**31 - 1)])
@@ -174,7 +175,8 @@ def test_no_command_takes_memory_for_a_header(tmp_path, size):
         rf"0\.png: found an image of {size[1]} x {size[0]} pixels.* expected at most 400 megapixels"
     )
     refused(lambda: describe_capture(InfoOptions(capture=tmp_path)), match)
-    refused(lambda: open_capture(tmp_path).find_mask(), match)
+    options = RecipeOptions(auto_mask=True)
+    refused(lambda: prepare_capture(open_capture(tmp_path), options=options), match)
     refused(lambda: open_capture(tmp_path).read_mask(size), match)
     refused(lambda: measure_light_intensities(find_ball_files(tmp_path), lights, "card"), match)
     for number in range(3):

@@ -14,7 +14,7 @@ from torch.nn.functional import normalize, pad
 
 from conftest import directions_at
 from scenes import evaluate, spiral_lights
-from splinecli.capture import Capture, read_capture
+from splinecli.capture import Capture
 from splinecli.estimate.fits.least_squares import alternating_signs
 from splinecli.estimate.inference import estimate_normals
 from splinecli.estimate.methods import make_estimator
@@ -32,6 +32,7 @@ from splinecli.evaluation.protocol import Protocol
 from splinecli.evaluation.trials import scored_rows
 from splinecli.lights.lighting import LightingAt, PixelLighting
 from splinecli.maths.normals import unit
+from splinecli.recipe import read_capture
 from tiny_networks import TINY
 
 LIGHTS = spiral_lights(6, 60)

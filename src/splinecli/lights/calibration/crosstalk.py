@@ -58,10 +58,12 @@ def measure_crosstalk(
     mask, normals = target_normals(files, common_size(files.facts)[0][:2], "ball")
     check_exposures(files.facts)
     capture = CaptureSource(
-        CaptureFiles("gray ball", files.folder.name, files.folder, files.images, files.folder),
-        files.facts,
-        placeholders(count),
-        np.ones((count, 3)),
+        files=CaptureFiles(
+            "gray ball", files.folder.name, files.folder, files.images, files.folder
+        ),
+        facts=files.facts,
+        light_directions=placeholders(count),
+        light_intensities=np.ones((count, 3)),
         radiometry=replace(radiometry, ambient=find_named(files.folder, AMBIENT)),
     )
     rows = np.linspace(0, len(normals) - 1, min(len(normals), _MOST_PIXELS)).astype(np.intp)

@@ -64,10 +64,12 @@ def measure_light_intensities(
     mask, normals = target_normals(files, common_size(files.facts)[0][:2], target)
     check_exposures(files.facts)
     capture = CaptureSource(
-        CaptureFiles("gray target", files.folder.name, files.folder, files.images, files.folder),
-        files.facts,
-        light_directions,
-        np.ones((n_lights, 3)),
+        files=CaptureFiles(
+            "gray target", files.folder.name, files.folder, files.images, files.folder
+        ),
+        facts=files.facts,
+        light_directions=light_directions,
+        light_intensities=np.ones((n_lights, 3)),
         radiometry=replace(radiometry, ambient=find_named(files.folder, AMBIENT)),
     )
     rows = np.linspace(0, len(normals) - 1, min(len(normals), 1 << 16)).astype(np.int64)

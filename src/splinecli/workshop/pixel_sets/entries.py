@@ -14,6 +14,7 @@ from splinecli.capture import capture_name, open_capture
 from splinecli.capture.files import digest
 from splinecli.capture.record import name_reading
 from splinecli.errors import InputError, OutputError
+from splinecli.recipe import RecipeOptions, prepare_capture
 from splinecli.system.files import file_sha256, free_name, replacing
 from splinecli.system.machine import import_extra
 from splinecli.workshop.pixel_sets.store import ARRAYS, Pixels, PixelSetWriter
@@ -90,7 +91,7 @@ def add_capture(
             raise CaptureChangedError(problem, path=folder, hint=hint)
     if source.files.ground_truth is None:
         raise InputError("the capture has no ground truth, which training needs", path=folder)
-    capture = source.read(as_stored=as_stored)
+    capture = prepare_capture(source, options=RecipeOptions(as_stored=as_stored))
     assert capture.ground_truth is not None
     normals = capture.ground_truth[capture.mask]
     # The PRPS images of CyclesPS are used at half resolution.

@@ -1,0 +1,346 @@
+"""The recipe: how the stored pixels of a capture become trusted observations, step by step.
+
+    colours of the lamps -> mask -> registration -> mask of the aligned images -> observations,
+    without lens blur -> lights -> intensities -> saturation -> judgement -> refined lights
+
+`infer` follows all steps of the table STEPS, `info` too, a trial of `evaluate` enters at the lights
+with the images of its draw, and arrays enter at the observations. Nothing else prepares images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from splinecli.capture.linearise import StoredPixels
+from splinecli.capture.reader import open_capture
+from splinecli.capture.record import Capture, check_light_indices
+from splinecli.capture.source import Source
+from splinecli.errors import InputError
+from splinecli.images.lamps import estimate_light_intensities, lamp_colours
+from splinecli.images.lens_blur import remove_blur, surroundings
+from splinecli.images.saturation import find_object, restore_saturated
+from splinecli.judge.checks import check_capture
+from splinecli.lights.light_fit import refine_capture
+from splinecli.maths import Float64Array
+from splinecli.recipe.reading import (
+    Observed,
+    compared_pixels,
+    exposure_warnings,
+    read_observations,
+)
+from splinecli.recipe.registration import register
+from splinecli.recipe.work import USUAL, RecipeOptions, Work
+from splinecli.records.capture_warnings import (
+    ESTIMATED_INTENSITIES,
+    CaptureWarning,
+    estimated_lights,
+)
+from splinecli.system.files import StrPath
+
+Advance = Callable[[float, str], object]  # called after each image, with 1 and the step's note
+
+
+def find_colours(work: Work, advance: Callable[[], object]) -> Work:
+    """Compare the colours of the images before others compare them pixel by pixel."""
+    source, mask = work.files, work.files.read_mask(work.shape)
+    rows = compared_pixels(int(np.count_nonzero(mask)))
+    colours = []
+    for pixels in source.read_pixels(mask, work.indices, lambda each: each, advance, wanted=rows):
+        if pixels.linear.shape[1] != 3:
+            return replace(work, colours_known=True)
+        colours.append(pixels.colours())
+    return _with_colours(work, *lamp_colours(np.stack(colours)))
+
+
+def _with_colours(
+    work: Work, colours: Float64Array | None, warnings: Sequence[CaptureWarning]
+) -> Work:
+    """Return the work whose images are divided by the colours (F, 3) of their lamps."""
+    source = work.source
+    if colours is not None:
+        intensities = source.light_intensities.copy()
+        intensities[list(work.indices)] *= colours
+        source = replace(source, light_intensities=intensities)
+    found = (*work.warnings, *warnings)
+    return replace(work, source=source, colours=colours, colours_known=True, warnings=found)
+
+
+def find_mask(work: Work, advance: Callable[[], object]) -> Work:
+    """Find the object in all images of the source; see find_object.
+
+    Raises InputError if no object stands out.
+    """
+    source = work.files
+    everywhere = source.window.of(np.ones(work.shape, np.bool_))
+    total = np.zeros(everywhere.size, np.float32)
+    every = range(source.n_lights)
+    for colours in source.read_pixels(everywhere, every, StoredPixels.colours, advance):
+        total += colours.mean(axis=1)
+    try:
+        mask = find_object(total.reshape(everywhere.shape))
+    except InputError as error:
+        raise InputError(error.problem, path=source.files.folder, hint=error.hint) from None
+    if source.alignment is not None:
+        mask &= source.alignment.common
+    return replace(work, source=replace(source, automatic_mask=mask))
+
+
+def observe(work: Work, advance: Callable[[], object]) -> Work:
+    """Read the images, and remove the blur of the lens.
+
+    If the lamps turn out to have different colours, the images are read again, because only the
+    mean of their channels was kept.
+
+    Raises:
+        UsageError: the indices of the images are not valid.
+        InputError: an image, the mask or the ground truth cannot be read or does not fit the
+            others, or Capture rejects the lights.
+    """
+    source, indices = work.source, work.indices
+    mask = source.mask_for(indices)
+    truth, of_truth = source.read_ground_truth(mask)
+    sharpens = source.has_neighbours and not work.options.as_stored
+    around = surroundings(mask) if sharpens else None
+
+    def read(source: Source) -> Observed:
+        images = source.read_pixels(mask, indices, lambda each: each, advance, around=around)
+        return read_observations(images, len(indices), mask, around, source.white_level)
+
+    observed = read(source)
+    if observed.colours is not None and _compares_colours(work):
+        work = _with_colours(work, *lamp_colours(observed.colours))
+        if work.colours is not None:
+            del observed
+            observed = read(source := work.source)
+    lamps, of_lamps = source.near_lamps(mask)
+    of_mask = source.mask_warnings(mask, indices)
+    exposure = exposure_warnings(observed, inverted=bool(of_mask))
+    blur = None if around is None else remove_blur(observed.observations, mask, around)
+    capture = Capture(
+        source.name,
+        observed.observations[: observed.saturation.n_pixels],
+        source.light_directions[list(indices)],
+        indices,
+        mask,
+        truth,
+        (*source.warnings, *work.warnings, *exposure, *of_truth, *of_lamps, *of_mask),
+        estimated_colours=work.colours,
+        white_level=observed.saturation.white_level,
+        removed_blur=blur,
+        lamps=None if lamps is None else lamps.choose_lights(indices),
+        camera_matrix=None if lamps is not None else source.camera(),
+    )
+    return replace(
+        work, capture=capture, saturation=observed.saturation, images=observed.images, warnings=()
+    )
+
+
+def find_lights(work: Work, _: Callable[[], object]) -> Work:
+    """Estimate the light directions from the observations.
+
+    Raises InputError if the images do not determine the lights, or the estimated lights cannot give
+    normals.
+    """
+    from splinecli.lights.unknown_lights import find_lights
+
+    capture, options = work.made, work.options
+    try:
+        found = find_lights(
+            capture.observations,
+            capture.mask,
+            work.source.intensities_known,
+            first_light=options.first_light,
+            refuse=options.refuses_lights,
+        )
+    except InputError as error:
+        raise InputError(f"{capture.name}: {error.problem}", hint=error.hint) from None
+    capture = replace(
+        capture,
+        light_directions=found.directions,
+        light_errors_deg=found.errors_deg,
+        warnings=(*capture.warnings, estimated_lights(found.errors_deg)),
+    )
+    return replace(work, capture=capture, found_intensities=found.intensities)
+
+
+def divide_by_intensities(work: Work, _: Callable[[], object]) -> Work:
+    """Divide by light intensities that are estimated from all pixels, where none are known."""
+    capture, intensities = work.made, work.found_intensities
+    if intensities is None and not work.source.intensities_known:
+        intensities = estimate_light_intensities(
+            capture.observations, work.saturated.flags, work.lights_of
+        )
+    if intensities is None:
+        return work
+    lowest, highest = intensities.min(), intensities.max()
+    digits = 4 if f"{lowest:.2f}" == f"{highest:.2f}" else 2
+    text = (
+        f"The light intensities were estimated from the images: they are unequal, from"
+        f" {lowest:.{digits}f} to {highest:.{digits}f} times their mean. Use --intensities FILE if"
+        " you have measured them, or --intensities equal to assume equal ones."
+    )
+    capture = replace(
+        capture,
+        observations=np.divide(capture.observations, intensities, dtype=np.float32),
+        estimated_intensities=intensities,
+        warnings=(*capture.warnings, CaptureWarning(ESTIMATED_INTENSITIES, text)),
+    )
+    return replace(work, capture=capture)
+
+
+def restore(work: Work, _: Callable[[], object]) -> Work:
+    """Replace saturated observations by estimates; see restore_saturated."""
+    flags = work.saturated.flags
+    if flags is None:
+        return work
+    observations = work.made.observations.copy()
+    restored = restore_saturated(observations, flags, work.lights_of)
+    if restored is None:
+        return work
+    return replace(work, capture=replace(work.made, observations=observations, restored=restored))
+
+
+def judge(work: Work, _: Callable[[], object]) -> Work:
+    """Check the lights and the images against each other; see judge/checks.py."""
+    judgement = check_capture(work.source, work.made, strict=work.options.strict)
+    return replace(work, judgement=judgement)
+
+
+def refine(work: Work, _: Callable[[], object]) -> Work:
+    """Refine rough light directions; see refine_capture."""
+    options, known = work.options, work.source.intensities_known
+    refined = refine_capture(work.made, error_deg=options.light_error_deg, intensities_known=known)
+    return replace(work, capture=refined)
+
+
+def _compares_colours(work: Work) -> bool:
+    """Whether the colours of the lamps may differ, and were not compared yet."""
+    return work.source.lamps_may_differ and not (work.colours_known or work.options.as_stored)
+
+
+def _needs_colours(work: Work) -> bool:
+    """Whether a step before the observations compares the images pixel by pixel."""
+    return _compares_colours(work) and (work.options.align or _finds_mask(work))
+
+
+def _finds_mask(work: Work) -> bool:
+    return work.options.auto_mask and not work.source.has_mask
+
+
+def _used(work: Work) -> int:
+    return len(work.indices)
+
+
+def _every(work: Work) -> int:
+    return work.source.n_lights
+
+
+@dataclass(frozen=True)
+class Step:
+    """A row of STEPS."""
+
+    name: str
+    run: Callable[[Work, Callable[[], object]], Work]
+    is_wanted: Callable[[Work], bool] = lambda work: True
+    n_images: Callable[[Work], int] = lambda work: 0  # that it reads
+    note: str = ""  # beside the progress of these
+
+
+STEPS = (
+    Step("colours", find_colours, _needs_colours, _used, "comparing colours"),
+    Step("mask", find_mask, _finds_mask, _every, "finding the object"),
+    Step("registration", register, lambda work: work.options.align, _used, "aligning"),
+    Step(
+        "mask of aligned images",
+        find_mask,
+        lambda work: work.options.align and _finds_mask(work),
+        _every,
+        "finding the object",
+    ),
+    Step("observations", observe, n_images=_used, note="reading"),
+    Step("lights", find_lights, lambda work: work.options.finds_lights),
+    Step("intensities", divide_by_intensities, lambda work: not work.options.as_stored),
+    Step("saturation", restore, lambda work: not work.options.as_stored),
+    Step("judgement", judge, lambda work: work.options.judges),
+    Step("refinement", refine, lambda work: work.options.refine_lights),
+)
+_PLACES = {step.name: place for place, step in enumerate(STEPS)}
+
+
+def follow(
+    work: Work,
+    first: str = STEPS[0].name,
+    last: str = STEPS[-1].name,
+    advance: Advance = lambda amount, note: None,
+) -> Work:
+    """Return the work after the steps from `first` to `last` that it needs."""
+    for step in STEPS[_PLACES[first] : _PLACES[last] + 1]:
+        if step.is_wanted(work):
+            work = step.run(work, lambda note=step.note: advance(1, note))  # type: ignore[misc]
+    return work
+
+
+def images_to_read(work: Work) -> int:
+    """Return how many images the recipe reads, counting an image again each time."""
+    return sum(step.n_images(work) for step in STEPS if step.is_wanted(work))
+
+
+def begin(
+    source: Source,
+    light_indices: Sequence[int] | None = None,
+    options: RecipeOptions = USUAL,
+) -> Work:
+    """Return the work on the images of these lights (None for all), before the first step.
+
+    Raises UsageError if an index is out of range or repeated, or there are fewer than three.
+    """
+    every = tuple(range(source.n_lights))
+    indices = every if light_indices is None else check_light_indices(light_indices, len(every))
+    return Work(source, indices, options)
+
+
+def prepare_capture(
+    source: Source,
+    light_indices: Sequence[int] | None = None,
+    options: RecipeOptions = USUAL,
+    advance: Advance = lambda amount, note: None,
+) -> Capture:
+    """Return the capture under the chosen lights (None for all), in the order given, unjudged.
+
+    Only the images of these lights are read, one at a time. Values outside the mask are ignored.
+    Raises the errors of `begin` and of the steps.
+
+    Examples:
+        >>> from splinecli.capture import open_capture
+        >>> from splinecli.recipe.steps import prepare_capture
+        >>> capture = prepare_capture(open_capture("examples/medallion"), [0, 2, 4])
+        >>> capture.observations.shape, capture.light_directions.shape
+        ((11836, 3), (3, 3))
+    """
+    return follow(begin(source, light_indices, options), last="saturation", advance=advance).made
+
+
+def read_capture(
+    folder: StrPath,
+    *,
+    lights: StrPath | None = None,
+    intensities: StrPath | None = None,
+    mask: StrPath | None = None,
+    ground_truth: StrPath | None = None,
+    light_indices: Sequence[int] | None = None,
+    as_stored: bool = False,
+) -> Capture:
+    """Open a capture with open_capture and read it with prepare_capture.
+
+    Examples:
+        >>> from splinecli.recipe import read_capture
+        >>> read_capture("examples/medallion").n_lights
+        10
+    """
+    source = open_capture(
+        folder, lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth
+    )
+    return prepare_capture(source, light_indices, RecipeOptions(as_stored=as_stored))

@@ -1,0 +1,125 @@
+"""The state of a capture while the recipe prepares it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from splinecli.capture.formats.images import common_size
+from splinecli.capture.record import Capture
+from splinecli.capture.source import CaptureSource, Source
+from splinecli.errors import UsageError
+from splinecli.images.saturation import Saturation
+from splinecli.judge.checks import Judgement
+from splinecli.maths import Float64Array, Integers
+from splinecli.recipe.reading import ImageSummary
+from splinecli.records.capture_warnings import CaptureWarning
+
+
+@dataclass(frozen=True)
+class RecipeOptions:
+    """What the user wants of the recipe."""
+
+    # Use the stored values: keep lens blur, colours of lamps and saturated pixels, and estimate no
+    # intensities.
+    as_stored: bool = False
+    auto_mask: bool = False  # if there is no mask, find the object in the images
+    align: bool = False  # align images that moved between exposures
+    finds_lights: bool = False  # estimate the light directions from the images
+    first_light: str | None = None  # the side from which the first of these lights comes
+    refuses_lights: bool = True  # raise InputError for lights that the images do not determine
+    judges: bool = True  # check lights and images against each other
+    strict: bool = False  # also warn of properties that the images leave undetermined
+    refine_lights: bool = False  # refine rough light directions
+    light_error_deg: float | None = None  # the usual error of these; None for the default
+
+
+USUAL = RecipeOptions()
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """A source on its way to a capture: each step of the recipe returns another one.
+
+    source: with the mask, the motion and the colours of the lamps once they are found.
+    indices: the images that are used, in their order.
+    colours: (F, 3), the colours of the lamps that the source's intensities contain; None for none.
+    colours_known: whether the images were already compared to find these.
+    warnings: of the steps before the capture exists.
+    capture, saturation, images: set by the step `observations`.
+    found_intensities: (F,), estimated together with the lights, or None.
+    judgement: the result of the last step.
+    """
+
+    source: Source
+    indices: tuple[int, ...]
+    options: RecipeOptions = USUAL
+    colours: Float64Array | None = None
+    colours_known: bool = False
+    warnings: tuple[CaptureWarning, ...] = ()
+    capture: Capture | None = None
+    saturation: Saturation | None = None
+    images: tuple[ImageSummary, ...] = ()
+    found_intensities: Float64Array | None = None
+    judgement: Judgement | None = None
+
+    @property
+    def made(self) -> Capture:
+        """The capture, which exists once the step `observations` was run."""
+        assert self.capture is not None
+        return self.capture
+
+    @property
+    def saturated(self) -> Saturation:
+        """The saturated observations of the capture."""
+        assert self.saturation is not None
+        return self.saturation
+
+    @property
+    def files(self) -> CaptureSource:
+        """The source, of steps that only files need."""
+        if not isinstance(self.source, CaptureSource):
+            raise UsageError("this step needs a capture in files")
+        return self.source
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Height and width of the stored images. Raises InputError if their sizes differ."""
+        return common_size(self.files.facts)[0][:2]
+
+    def choose_images(self, positions: Sequence[int]) -> Work:
+        """Return the work on some of the images, with a capture of its own, from their positions.
+
+        The white level is decided from these images alone, as if only they had been read.
+        """
+        capture, saturation = (
+            self.made.choose_lights(positions),
+            self.saturated.choose_images(positions),
+        )
+        if saturation.white_level != capture.white_level:
+            capture = replace(capture, white_level=saturation.white_level)
+        return replace(
+            self,
+            indices=tuple(self.indices[position] for position in positions),
+            capture=capture,
+            saturation=saturation,
+            images=tuple(self.images[position] for position in positions),
+        )
+
+    def choose_pixels(self, rows: Integers) -> Work:
+        """Return the work on the pixels with these rising rows of the observations."""
+        capture = self.made.choose_pixels(rows)
+        return replace(self, capture=capture, saturation=self.saturated.choose_pixels(rows))
+
+    def lights_of(self, rows: Integers) -> Float64Array:
+        """Return the light vectors of some pixels: (F, 3), or (p, F, 3) with the falloff of near
+        lamps on a plane.
+        """
+        capture = self.made
+        if capture.lamps is None:
+            return capture.light_directions
+        places = np.divmod(np.flatnonzero(capture.mask)[rows], capture.mask.shape[1])
+        directions, attenuation = capture.lamps.light_at(capture.lamps.plane_points(*places))
+        return np.asarray(directions * attenuation[..., None], np.float64)
