@@ -1,5 +1,6 @@
 """Lights, shapes and captures of known normals, which the tests of many rooms share."""
 
+import json
 import struct
 import zlib
 from dataclasses import dataclass
@@ -87,6 +88,20 @@ def shade(
     return np.asarray(np.clip(seen, 0, None))
 
 
+def read_image(path: str | Path) -> Any:
+    """The pixels of an image as OpenCV reads them: BGR, in their own type."""
+    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+
+
+def write_image(path: str | Path, pixels: NDArray[Any]) -> None:
+    """Write pixels (H, W) or (H, W, 3) BGR in the format of the name."""
+    assert cv2.imwrite(str(path), pixels)
+
+
+def read_json(path: str | Path) -> Any:
+    return json.loads(Path(path).read_text("utf-8"))
+
+
 def write_capture(
     folder: Path,
     images: NDArray[np.generic],
@@ -104,11 +119,11 @@ def write_capture(
     folder.mkdir(parents=True, exist_ok=True)
     for number, image in enumerate(images, start=first):
         stored = image if image.ndim == 2 else image[..., ::-1]
-        assert cv2.imwrite(str(folder / names.format(number)), stored)
+        write_image(folder / names.format(number), stored)
     if lights is not None:
         np.savetxt(folder / "light_directions.txt", lights, fmt="%.9f")
     if mask is not None:
-        assert cv2.imwrite(str(folder / "mask.png"), mask.astype(np.uint8) * 255)
+        write_image(folder / "mask.png", mask.astype(np.uint8) * 255)
     if normals is not None:
         np.save(folder / "normals_gt.npy", normals)
     if intensities is not None:

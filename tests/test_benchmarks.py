@@ -1,7 +1,6 @@
 """Each benchmark runs to its end on small inputs and prints every row."""
 
 import importlib
-import json
 import math
 import re
 import time
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from scenes import read_json
 from splinecli import __version__
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
@@ -176,7 +176,7 @@ def test_gpu_session(tmp_path):
         and "FileNotFoundError" in report
         and "there is no time left" in report
     )
-    steps = [entry["step"] for entry in json.loads((tmp_path / "report.json").read_text())]
+    steps = [entry["step"] for entry in read_json(tmp_path / "report.json")]
     assert steps == ["apart", "missing", "late"]
 
 
@@ -196,7 +196,7 @@ def test_all_figures(run, tmp_path):
     )
     arguments = (*places, "--trials", "2", "--only", "noise/ls")
     assert run("all_figures", *arguments).startswith("noise, ls: ")
-    measured = json.loads(stored.read_text())["noise"]
+    measured = read_json(stored)["noise"]
     assert (measured["version"], len(measured["weights"])) == (__version__, 8)
     assert list(measured["rows"]) == ["ls"]
     assert list(measured["rows"]["ls"]) == ["0", "2", "4", "8"]

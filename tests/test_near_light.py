@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 import splinecli
-from scenes import spiral_lights
+from scenes import Floats, Mask, spiral_lights
 from splinecli.capture import Capture
 from splinecli.capture.linearise import Window
 from splinecli.capture.near_lamps import NearLamps
@@ -20,13 +21,12 @@ from splinecli.estimate.methods import make_estimator
 from splinecli.maths.normals import unit
 from splinecli.maths.pixel_grid import Blocks, pixel_rays
 
-Floats = NDArray[np.float64]
 SIDE = 40
 LIGHTS = spiral_lights(10, 50, 20)
 MATRIX = np.array([(60.0, 0, 20.5), (0, 60.0, 18.0), (0, 0, 1)])
 
 
-def surface(kind: str, side: int = SIDE) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def surface(kind: str, side: int = SIDE) -> tuple[Floats, Floats, Mask]:
     """Return points (P, 3) with a mean height of 0 in a frame that is 2 wide, normals (P, 3) and
     the mask.
     """
@@ -47,7 +47,7 @@ def surface(kind: str, side: int = SIDE) -> tuple[Floats, Floats, NDArray[np.boo
 
 
 def capture_of(
-    points: Floats, normals: Floats, mask: NDArray[np.bool_], positions: Floats, strengths: Floats
+    points: Floats, normals: Floats, mask: Mask, positions: Floats, strengths: Floats
 ) -> Capture:
     towards = positions - points[:, None]
     distance = np.linalg.norm(towards, axis=2)
@@ -185,7 +185,7 @@ def test_least_squares_does_not_depend_on_the_camera():
         estimate_normals(each, estimator).normal_map
         for each in (capture, replace(capture, camera_matrix=None))
     ]
-    np.testing.assert_allclose(*maps, atol=1e-4)
+    assert_allclose(*maps, atol=1e-4)
     matte = estimate_normals(glossy_sphere(20, gloss=0), make_estimator("iw12"))
     assert matte.errors.median < 0.1  # shadows at the rim
 
@@ -197,7 +197,7 @@ def test_a_camera_far_away_is_orthographic():
         estimate_normals(each, estimator).normal_map
         for each in (capture, replace(capture, camera_matrix=None))
     ]
-    np.testing.assert_allclose(*maps, atol=2e-3)
+    assert_allclose(*maps, atol=2e-3)
 
 
 def images_of(capture: Capture) -> NDArray[np.float32]:
@@ -213,7 +213,7 @@ def test_the_python_door_takes_a_camera():
         *arguments, camera_matrix=capture.camera_matrix, method="st14"
     )
     expected = estimate_normals(capture, make_estimator("st14")).normal_map
-    np.testing.assert_allclose(found.normal_map, expected, atol=1e-5)
+    assert_allclose(found.normal_map, expected, atol=1e-5)
     assert (
         np.abs(splinecli.estimate_normals(*arguments, method="st14").normal_map - expected).max()
         > 0.01
@@ -255,4 +255,4 @@ def test_the_python_door_takes_positions():
     arguments = images_of(capture), LIGHTS * 4.0, capture.mask
     estimate = splinecli.estimate_normals(*arguments, pixel_size=2 / SIDE, method="iw12")
     expected = estimate_normals(capture, make_estimator("iw12"))
-    np.testing.assert_allclose(estimate.normal_map, expected.normal_map, atol=1e-5)
+    assert_allclose(estimate.normal_map, expected.normal_map, atol=1e-5)

@@ -1,6 +1,5 @@
 """The functions for notebooks: the same normals as `splinecli infer`, from arrays."""
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 import splinecli
+from scenes import read_image, read_json, write_image
 from splinecli.capture.arrays import open_arrays
 from splinecli.cli.main import main
 from splinecli.errors import InputError, UsageError
@@ -25,10 +25,7 @@ def read_medallion(folder: Path = MEDALLION) -> tuple[NDArray[Any], ...]:
     """Images (F, H, W, 3), light directions (F, 3), intensities (F, 3) and mask (H, W), as a
     notebook reads them.
     """
-    images = [
-        cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., ::-1]
-        for path in sorted(folder.glob("[01]*.png"))
-    ]
+    images = [read_image(path)[..., ::-1] for path in sorted(folder.glob("[01]*.png"))]
     directions, intensities = (
         np.loadtxt(folder / f"light_{name}.txt") for name in ("directions", "intensities")
     )
@@ -77,7 +74,7 @@ def test_the_same_warnings_as_infer(tmp_path):
     images, directions, intensities, mask = read_medallion()
     small = np.zeros_like(mask)
     small[80:110, 80:110] = mask[80:110, 80:110]
-    assert cv2.imwrite(str(tmp_path / "mask.png"), small * np.uint8(255))
+    write_image(tmp_path / "mask.png", small * np.uint8(255))
     options = [
         "--light-indices",
         "0,3,6",
@@ -97,7 +94,7 @@ def test_the_same_warnings_as_infer(tmp_path):
         progress=done.append,
     )
     assert sum(done) == small.sum() > 0
-    told = json.loads((tmp_path / "medallion/report.json").read_text())["warnings"]
+    told = read_json(tmp_path / "medallion/report.json")["warnings"]
     assert [warning.code for warning in estimate.capture.warnings] == [
         warning["code"] for warning in told
     ]

@@ -130,8 +130,8 @@ def test_a_map_is_a_row(monkeypatch):
     # so that it is no photograph
     assert {"slant.npy", "slant.tiff", "slant.png"} <= set(own_files())
     assert (
-        "| `slant` | `slant.npy`, `slant.tiff`, `slant.png` | cosine between normal and camera"
-        " axis |" in (make_tables.maps_table())
+        "| `slant` | `slant.npy`, `slant.tiff`, `slant.png` | cosine between normal and camera "
+        "axis |" in (make_tables.maps_table())
     )
     assert results_bytes(100, 4, maps=["slant"]) - results_bytes(100, 4) == 700
     page = result_page(REPORT, estimate.normal_map, mask, values={"slant": values})

@@ -17,6 +17,7 @@ import tifffile
 from PIL import Image
 
 import scenes
+from scenes import write_image
 from splinecli.capture import CaptureSource, Overrides, find_capture_files, open_capture
 from splinecli.capture.formats.images import decode_image
 from splinecli.capture.light_files import read_light_positions
@@ -58,7 +59,7 @@ def check(source: CaptureSource, mask: np.ndarray | None = DISC) -> list[str]:
 
 def picture(path: Path, image: np.ndarray) -> None:
     path.parent.mkdir(exist_ok=True)
-    assert cv2.imwrite(str(path), image)
+    write_image(path, image)
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,11 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import tifffile
 
+from scenes import write_image
 from splinecli.capture import open_capture
 from splinecli.errors import InputError
 from splinecli.recipe import prepare_capture, read_capture
@@ -55,7 +55,7 @@ def test_identical_lights(tmp_path, light, as_stored):
     rng = np.random.default_rng(0)
     for number in range(8):
         shading = np.linspace(0.1, 1, 900).reshape(30, 30) * rng.uniform(0.5, 1.5)
-        cv2.imwrite(str(tmp_path / f"{number}.png"), np.rint(shading * 40_000).astype(np.uint16))
+        write_image(tmp_path / f"{number}.png", np.rint(shading * 40_000).astype(np.uint16))
     np.savetxt(tmp_path / "lights.txt", [light] * 8)
     with pytest.raises(InputError, match="the 8 lights are in one plane"):
         read_capture(tmp_path, as_stored=as_stored)
@@ -67,8 +67,8 @@ def test_identical_lights(tmp_path, light, as_stored):
 )
 def test_a_file_that_may_not_be_read(folder, monkeypatch, name):
     """Even root may not."""
-    cv2.imwrite(str(folder / "mask.png"), np.full((20, 25), 255, np.uint8))
-    cv2.imwrite(str(folder / "ambient.png"), np.full((20, 25), 255, np.uint8))
+    write_image(folder / "mask.png", np.full((20, 25), 255, np.uint8))
+    write_image(folder / "ambient.png", np.full((20, 25), 255, np.uint8))
     np.save(folder / "normals_gt.npy", np.broadcast_to([0.0, 0.0, 1.0], (20, 25, 3)))
     np.savetxt(folder / "light_intensities.txt", np.ones((4, 3)))
     for owner, original in ((Path, Path.open), (builtins, builtins.open)):

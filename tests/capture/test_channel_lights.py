@@ -1,6 +1,5 @@
 """Three coloured lamps at once: gray spheres whose crosstalk and normals are known."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scenes import ring_lights, shade, sphere, write_capture
+from scenes import Floats, read_json, ring_lights, shade, sphere, write_capture
 from splinecli.capture.channel_lights import channel_lights
 from splinecli.errors import InputError, UsageError
 from splinecli.lights.calibration.balls import find_ball_files
@@ -19,7 +18,6 @@ from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions, InfoOptions, Reading
 from splinecli.pipeline.info import describe_capture, summary_lines
 
-Floats = NDArray[np.float64]
 NORMALS, MASK = sphere(90)
 LIGHTS = np.concatenate((ring_lights(3, 35), ring_lights(3, 50, 0.8)))
 CROSSTALK = np.array([[1.0, 0.2, 0.05], [0.15, 1.3, 0.2], [0.02, 0.25, 0.7]])
@@ -65,7 +63,7 @@ def errors_deg(folder: Path, out: Path, lights: Floats, **options: Any) -> Float
 def test_a_colour_image_gives_the_normals_of_a_gray_sphere(count, tmp_path):
     folder = write(tmp_path / "gray", count)
     assert errors_deg(folder, tmp_path / "out", LIGHTS[: 3 * count]).max() < 0.2
-    report = json.loads((tmp_path / "out/gray/report.json").read_text())
+    report = read_json(tmp_path / "out/gray/report.json")
     assert report["n_lights"] == 3 * count and "lights_in_channels" in [
         each["code"] for each in report["warnings"]
     ]

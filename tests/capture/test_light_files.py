@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from scipy.io import savemat
 
+from scenes import write_image
 from splinecli.capture import read_light_directions, read_light_intensities
 from splinecli.capture.light_files import check_writable, match_images, read_lights
 from splinecli.errors import InputError
@@ -55,12 +57,12 @@ def test_directions(tmp_path, form):
     for encoding in ("utf-8", "utf-8-sig", "utf-16"):
         directions = read_light_directions(write(tmp_path, FORMS[form], encoding), 4)
         assert directions.dtype == np.float64
-        np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-15)
+        assert_allclose(directions, DIRECTIONS, atol=1e-15)
 
 
 def test_lengths_far_from_one_neither_overflow_nor_underflow(tmp_path):
     directions = read_light_directions(write(tmp_path, "0 3e300 4e300\n0 3e-300 4e-300\n0 0 1"))
-    np.testing.assert_allclose(directions[:2], [[0, 0.6, 0.8]] * 2)
+    assert_allclose(directions[:2], [[0, 0.6, 0.8]] * 2)
 
 
 @settings(deadline=None)
@@ -83,7 +85,7 @@ def test_directions_round_trip(vectors, separator, counted, transposed):
         path = write(Path(folder), "\n".join(([str(len(values))] if counted else []) + rows))
         directions = read_light_directions(path, len(values))
     expected = values / np.linalg.norm(values, axis=1, keepdims=True)
-    np.testing.assert_allclose(directions, expected, rtol=1e-12, atol=1e-15)
+    assert_allclose(directions, expected, rtol=1e-12, atol=1e-15)
 
 
 COMMA = "A comma separates columns; write decimals with a point."
@@ -130,7 +132,7 @@ def test_wrong_directions(tmp_path, text, line, message):
 
 
 def test_files_that_are_no_text(tmp_path):
-    cv2.imwrite(str(tmp_path / "mask.png"), np.zeros((3, 3), np.uint8))
+    write_image(tmp_path / "mask.png", np.zeros((3, 3), np.uint8))
     write(tmp_path, "0 0 1 # \u00e9", encoding="latin-1")
     for name, message in (
         ("none.txt", r"none\.txt: the file does not exist\."),
@@ -195,7 +197,7 @@ def test_one_light_in_each_column_is_no_count(tmp_path, n_images):
     path = write(tmp_path, "1 0 0 1\n3 1 0 0\n2 1 1 1")
     expected = np.array([[1, 3, 2], [0, 1, 1], [0, 0, 1], [1, 0, 1]])
     expected = expected / np.linalg.norm(expected, axis=1, keepdims=True)
-    np.testing.assert_allclose(read_light_directions(path, n_images), expected)
+    assert_allclose(read_light_directions(path, n_images), expected)
 
 
 @pytest.mark.parametrize(
@@ -218,7 +220,7 @@ def test_rows_that_name_their_image(tmp_path, text, stem):
     images, how = match_images(table, wanted)
     assert how.startswith("name")
     found = dict(zip(images, directions, strict=True))
-    np.testing.assert_allclose([found[image] for image in wanted], DIRECTIONS, atol=1e-15)
+    assert_allclose([found[image] for image in wanted], DIRECTIONS, atol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -241,9 +243,7 @@ def test_factors_of_a_dome_are_inverse_intensities(tmp_path, factors, message):
         )
     )
     if message is None:
-        np.testing.assert_allclose(
-            read_lights(path, 4)[0].intensities, 1 / np.tile(factors, (3, 1)).T
-        )
+        assert_allclose(read_lights(path, 4)[0].intensities, 1 / np.tile(factors, (3, 1)).T)
     else:
         with pytest.raises(InputError, match=message):
             read_lights(path, 4)
@@ -255,7 +255,7 @@ def test_written_lights_are_read_again(tmp_path, suffix):
     path.write_bytes(
         check_writable(path)(DIRECTIONS, [Path(f"{number}.png") for number in range(4)])
     )
-    np.testing.assert_allclose(read_lights(path, 4)[1], DIRECTIONS, atol=1e-8)
+    assert_allclose(read_lights(path, 4)[1], DIRECTIONS, atol=1e-8)
     if suffix == ".csv":
         assert path.read_text().splitlines()[0] == "x,y,z"
 
@@ -265,7 +265,7 @@ def test_angles(tmp_path, text):
     # atan2(0.36, -0.48) = 143.13 degrees, asin(0.8) = 53.13 degrees.
     counted = "2 0 53.130102\n1 0 90\n3 270 53.130102\n4 143.130102 53.130102"
     directions = read_light_directions(write(tmp_path, text or counted), 4, form="azel")
-    np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-7)
+    assert_allclose(directions, DIRECTIONS, atol=1e-7)
 
 
 ADD_AZEL = ".*add --light-format azel"
@@ -342,7 +342,7 @@ def test_arrays(tmp_path, suffix, transposed):
         savemat(path, {"Dir": stored, **others}, do_compression=suffix != ".mat")
     else:
         write_opencv(path, camera=np.eye(3), lights=stored)
-    np.testing.assert_allclose(read_light_directions(path, 4), DIRECTIONS, atol=1e-7)
+    assert_allclose(read_light_directions(path, 4), DIRECTIONS, atol=1e-7)
 
 
 def test_refused_arrays(tmp_path):

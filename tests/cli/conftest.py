@@ -16,6 +16,7 @@ import pytest
 import typer
 
 import scenes
+from scenes import read_json
 from splinecli.cli.main import main
 from splinecli.maths.normals import unit
 
@@ -85,7 +86,7 @@ def medallion() -> Path:
 
 
 def read_report(folder: Path) -> dict:
-    return json.loads((folder / "report.json").read_text("utf-8"))
+    return read_json(folder / "report.json")
 
 
 class Run(NamedTuple):

@@ -8,12 +8,12 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
 from cli.conftest import write_capture
+from scenes import write_image
 
 Spoil = Callable[[Path], list[object] | None]
 
@@ -35,7 +35,7 @@ def write(name: str, content: bytes | np.ndarray) -> Spoil:
         if isinstance(content, bytes):
             (capture / name).write_bytes(content)
         else:
-            cv2.imwrite(str(capture / name), content)
+            write_image(capture / name, content)
 
     return spoil
 
@@ -125,17 +125,16 @@ USAGE_ERRORS = {
     "infer X -z": "no option -z. See 'splinecli infer --help'.",
     "infer X --msk": "no option --msk. Did you mean --auto-mask, --maps or --mask? See 'splinecli"
     " infer --help'.",
-    "prepare -o"
-    " s --lights 20": "no option --lights. Did you mean --n-lights? See 'splinecli prepare"
-    " --help'.",
+    "prepare -o s --lights 20": "no option --lights. Did you mean --n-lights? See 'splinecli"
+    " prepare --help'.",
     "infer X --n-lights abc": "--n-lights is 'abc'; expected a whole number of at least 3.",
     "prepare -o s --n-lights 20.5": "--n-lights is '20.5'; expected a whole number of at least 16.",
     "prepare -o s --n-lights 4": "--n-lights is '4'; expected a whole number of at least 16.",
-    "evaluate X --light-noise-deg"
-    " 1 --light-noise-deg x": "--light-noise-deg is 'x'; expected a number of at least 0.",
+    "evaluate X --light-noise-deg 1 --light-noise-deg x": "--light-noise-deg is 'x'; expected a"
+    " number of at least 0.",
     "infer X --stiffness 2": "--stiffness is now --discontinuity. See 'splinecli infer --help'.",
-    "info X --lights-format"
-    " azel": "--lights-format is now --light-format. See 'splinecli info --help'.",
+    "info X --lights-format azel": "--lights-format is now --light-format. See 'splinecli"
+    " info --help'.",
     "info X --light-frame exchanged": "--light-frame is 'exchanged'; exchanged is now swap-xy.",
     "infer X --device tpu": "--device is 'tpu'; expected one of 'auto', 'cpu', 'cuda'.",
 }

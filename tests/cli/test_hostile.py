@@ -195,8 +195,8 @@ def test_memory_that_runs_out_is_one_line(capture, make_capture, run, monkeypatc
     monkeypatch.setattr(cv2, "imdecode", Mock(wraps=cv2.imdecode, side_effect=decoded))
     result = run("infer", capture, "second", "--method", "ls", "-q")
     message = (
-        "splinecli: sphere: there is not enough memory. Close other programs, or use smaller"
-        " images.\n"
+        "splinecli: sphere: there is not enough memory. Close other programs, or use smaller "
+        "images.\n"
     )
     assert (result.code, result.err) == (1, message)
     assert Path("out/second/normals.png").exists()
@@ -250,8 +250,8 @@ def start(code: str) -> subprocess.Popen[str]:
         "print('ready', flush=True)\n    while True:\n        try: time.sleep(60)\n        except"
         " BaseException: pass",
         # A call into C that no signal interrupts.
-        "import numpy; a = numpy.ones((3000, 3000)); print('ready', flush=True)\n    for _ in"
-        " range(60): a @ a",
+        "import numpy; a = numpy.ones((3000, 3000)); print('ready', flush=True)\n"
+        "    for _ in range(60): a @ a",
     ],
 )
 def test_sigterm_always_ends_a_process(code):
@@ -287,10 +287,7 @@ def test_the_dependencies_have_no_known_holes():
         "pillow": (12, 3),  # writes beyond buffers, and bombs, in many formats
         "jinja2": (3, 1, 6),  # CVE-2025-27516
         # CVE-2025-53644: writes beyond a buffer in 4.10 and 4.11
-        "opencv-python-headless": (
-            4,
-            12,
-        ),
+        "opencv-python-headless": (4, 12),
         "safetensors": (0, 5),
     }.items():
         assert floors[name] >= floor, name

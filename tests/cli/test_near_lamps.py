@@ -5,12 +5,11 @@ the lamps are.
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from cli.test_schema import check
-from scenes import BUMP_LAMPS, BUMP_MM, write_bump
+from scenes import BUMP_LAMPS, BUMP_MM, read_image, write_bump, write_image
 
 
 @pytest.fixture
@@ -251,8 +250,8 @@ def test_albedo_and_saturation(infer, near):
     restored.
     """
     for path in near.glob("*.png"):
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        cv2.imwrite(str(path), np.minimum(image, 26_000))
+        image = read_image(path)
+        write_image(path, np.minimum(image, 26_000))
     stored = infer("--white-level", "26000", "--as-stored")
     restored = infer("--white-level", "26000", "--maps", "albedo")
     assert restored["angular_error_deg"]["mean"] < 0.5 * stored["angular_error_deg"]["mean"]

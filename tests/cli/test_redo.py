@@ -13,6 +13,7 @@ from unittest.mock import Mock
 import pytest
 
 from cli.conftest import read_report
+from scenes import read_json
 from splinecli.estimate.networks.weights import save_weights
 from splinecli.pipeline.batch import infer_batch
 from splinecli.pipeline.infer_options import InferOptions
@@ -104,7 +105,7 @@ def link_elsewhere(path: Path) -> None:
 
 
 def surrogate_among_files(path: Path) -> None:
-    report = json.loads(path.read_text())
+    report = read_json(path)
     path.write_text(json.dumps({**report, "files": ["\ud800"]}))
 
 
@@ -197,16 +198,14 @@ def test_bad_reports_of_other_captures_are_no_matter(capture, make_capture, run)
     Path("kept").touch()
     for name, (key, value) in zip(names, BAD_REPORTS, strict=True):
         path = Path("out", name, "report.json")
-        path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
+        path.write_text(json.dumps({**read_json(path), key: value}))
     result = run("infer", capture, make_capture("third"), "--method", "ls")
     assert (result.code, "Traceback" in result.err) == (0, False)
     page = Path("out/index.html").read_text("utf-8")
     assert "sphere" in page and "third" in page
     # The same where the captures themselves come next.
     assert run("infer", *names, "--method", "ls", "--update").code == 0
-    assert [
-        json.loads(Path("out", name, "report.json").read_text())["capture"] for name in names
-    ] == names
+    assert [read_json(Path("out", name, "report.json"))["capture"] for name in names] == names
     assert Path("kept").is_file()
 
 

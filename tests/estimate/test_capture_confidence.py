@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from scenes import directions_at
@@ -98,7 +99,7 @@ def test_the_order_of_lights_and_the_exposure_do_not_count():
     order = np.random.default_rng(3).permutation(capture.n_lights)
     other = capture.choose_lights(order.tolist())
     other = replace(other, observations=other.observations * np.float32(37))
-    np.testing.assert_allclose(features(other), features(capture), atol=1e-4)
+    assert_allclose(features(other), features(capture), atol=1e-4)
 
 
 def test_an_untrained_head_changes_little():
@@ -108,7 +109,7 @@ def test_an_untrained_head_changes_little():
     capture[turn] = np.log(2.0)
     found = CaptureHead()(errors, torch.zeros(2, PIXEL_FEATURES), capture)
     added = np.exp(-3.5) + np.radians(0.6 * 2.0)
-    np.testing.assert_allclose(found[:, 0].exp().detach(), errors[:, 0].exp() + added, rtol=1e-5)
+    assert_allclose(found[:, 0].exp().detach(), errors[:, 0].exp() + added, rtol=1e-5)
     np.testing.assert_array_equal(found[:, 1].detach(), errors[:, 1])
 
 

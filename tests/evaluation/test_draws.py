@@ -186,10 +186,7 @@ def test_a_part_of_the_images_and_pixels_keeps_the_level_of_its_images(folder):
     stored = observed(folder)
     assert stored.made.white_level == WhiteLevel(LEVEL, "images")
     dim = stored.choose_images([1, 4, 5, 6, 8])
-    assert (dim.made.white_level, dim.saturated.flags) == (
-        WhiteLevel(65_535, "full scale"),
-        None,
-    )
+    assert (dim.made.white_level, dim.saturated.flags) == (WhiteLevel(65_535, "full scale"), None)
     rows = np.arange(0, SIDE * SIDE, 7)
     bright = stored.choose_images([2, 4, 0, 1]).choose_pixels(rows).choose_pixels(np.arange(5, 300))
     alone = observed(folder, [2, 4, 0, 1])

@@ -8,12 +8,11 @@ import sys
 import time
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from kills import content
-from scenes import write_capture
+from scenes import write_capture, write_image
 from splinecli.errors import InputError
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.maths.normals import unit
@@ -68,9 +67,8 @@ def test_a_full_disk_leaves_what_was_there(folder, disk_kb):
     infer = f"{COMMAND} infer a --method ls -o disk --overwrite --format npy -q"
     fill = f"{infer} && cp -r disk before && cat /dev/zero >disk/fill 2>/dev/null;"
     script = (
-        f"mkdir disk; {mount} || exit 77; cp a/light_directions.txt disk/kept;"
-        f" {fill if disk_kb == 64 else ''}"
-        f" {infer}; echo $? >code; rm -f disk/fill; cp -r disk left"
+        f"mkdir disk; {mount} || exit 77; cp a/light_directions.txt disk/kept; "
+        f"{fill if disk_kb == 64 else ''} {infer}; echo $? >code; rm -f disk/fill; cp -r disk left"
     )
     done = shell(f"unshare --map-root-user --mount bash -c '{script}'", folder)
     if done.returncode or not (folder / "code").exists():
@@ -93,7 +91,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("large")
     lights = np.tile(LIGHTS, (4, 1))
     noise = np.random.default_rng(0).integers(0, 20_000, (1000, 1200), np.uint16)
-    cv2.imwrite(str(folder / "00.png"), noise)
+    write_image(folder / "00.png", noise)
     for number in range(1, len(lights)):
         os.link(folder / "00.png", folder / f"{number:02d}.png")
     np.savetxt(folder / "lights.txt", lights)
@@ -188,8 +186,8 @@ def test_a_limit_on_open_files(folder):
 
 
 BUSY = (
-    "splinecli: out/a: another splinecli process is writing into this folder."
-    " Wait for it to end, or choose another -o.\n"
+    "splinecli: out/a: another splinecli process is writing into this folder. Wait for it to end, "
+    "or choose another -o.\n"
 )
 
 

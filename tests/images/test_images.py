@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
-from scenes import shade, sphere_cap, spiral_lights, with_chunk, write_capture
+from scenes import Floats, shade, sphere_cap, spiral_lights, with_chunk, write_capture
 from splinecli.capture.formats.images import decode_image, to_linear
 from splinecli.capture.reader import open_capture
 from splinecli.errors import InputError
@@ -32,7 +33,7 @@ Images = NDArray[np.integer]
 FULL_SCALE = WhiteLevel(65_535, "full scale")
 
 
-def sphere(*, noise: float = 0.01) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def sphere(*, noise: float = 0.01) -> tuple[Floats, Floats]:
     """Images (F, H, W) of a matte sphere, which fills the picture, with a largest value of about 1;
     its normals.
     """
@@ -42,7 +43,7 @@ def sphere(*, noise: float = 0.01) -> tuple[NDArray[np.float64], NDArray[np.floa
     return images * rng.normal(1, noise, images.shape), normals
 
 
-def clip(images: NDArray[np.float64], level: int, exposure: float = 2.0) -> NDArray[np.uint16]:
+def clip(images: Floats, level: int, exposure: float = 2.0) -> NDArray[np.uint16]:
     return np.minimum(np.rint(images * exposure * level), level).astype(np.uint16)
 
 
@@ -169,7 +170,7 @@ def test_a_given_level_is_used_as_it_is():
         find(images.astype(np.uint8), given=4095)
 
 
-def ls_error_deg(folder: Path, normals: NDArray[np.float64], **settings: float) -> float:
+def ls_error_deg(folder: Path, normals: Floats, **settings: float) -> float:
     capture = prepare_capture(open_capture(folder, **settings))
     solution = np.linalg.lstsq(LIGHTS, capture.observations.T.astype(np.float64), rcond=None)[0]
     return float(angle_between_deg(unit(solution.T), normals.reshape(-1, 3)).mean())
@@ -186,7 +187,7 @@ def test_12_bit_images_are_restored_like_16_bit_ones(tmp_path):
     assert stored.white_level == capture.white_level
     assert (capture.observations > stored.observations)[~capture.restored].sum() == 0
     brighter = (capture.observations > stored.observations).any(axis=1)
-    np.testing.assert_array_equal(capture.restored.any(axis=1), brighter)
+    assert_array_equal(capture.restored.any(axis=1), brighter)
     found = ls_error_deg(folder, normals)
     full = ls_error_deg(write_capture(tmp_path / "full", clip(images, 65_535), LIGHTS), normals)
     assert found == pytest.approx(full, abs=0.02)
@@ -262,7 +263,7 @@ def test_tiff_of_12_bits_a_sample(tmp_path):
 
 
 GRID_LIGHTS = np.array([(x, y, 1.4) for x in (-1, 0, 1) for y in (-1, 0, 1)], dtype=float)
-GRID_LIGHTS /= np.linalg.norm(GRID_LIGHTS, axis=1, keepdims=True)
+GRID_LIGHTS = unit(GRID_LIGHTS)
 
 
 def matte(pixels: int) -> np.ndarray:
@@ -286,7 +287,7 @@ def clipped_at(level: float) -> tuple[np.ndarray, ...]:
 
 def test_matte_pixels_come_back():
     truth, saturated, stored, restored = clipped_at(0.6)
-    np.testing.assert_array_equal(restored[~saturated], stored[~saturated])
+    assert_array_equal(restored[~saturated], stored[~saturated])
     assert (restored >= stored).all()
     known = saturated.any(axis=1) & ((~saturated).sum(axis=1) >= 4)
     assert known.sum() > 50

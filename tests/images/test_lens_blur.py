@@ -5,6 +5,7 @@ image, is known.
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from scenes import shade, sphere_cap, spiral_lights
@@ -66,7 +67,7 @@ def test_sharp_images_stay_as_they_are(noise):
     )
     found, estimate = removed(images)
     assert estimate is None
-    np.testing.assert_array_equal(found, images)
+    assert_array_equal(found, images)
 
 
 def test_fine_texture_stays_as_it_is():
@@ -98,7 +99,7 @@ def test_the_filter_inverts_what_noise_leaves_of_the_signal():
     expected = g / (g**2 + NOISE * mean_power * frequency**2)
     waves = np.cos(2 * np.pi * frequency * np.arange(-REACH, REACH + 1))
     found = waves @ inverse_filter(sigma).sum(axis=0)
-    np.testing.assert_allclose(found, expected[:, 0], rtol=0.05)
+    assert_allclose(found, expected[:, 0], rtol=0.05)
 
 
 def test_only_the_object_and_what_surrounds_it_is_needed():
@@ -116,7 +117,7 @@ def test_only_the_object_and_what_surrounds_it_is_needed():
     far = np.where(mask | around, images, 7)  # the filter must not see these
     other = np.concatenate((far[:, mask], far[:, around]), axis=1).T.copy()
     remove_blur(other, mask, around)
-    np.testing.assert_array_equal(part, other)
+    assert_array_equal(part, other)
 
 
 def test_values_outside_the_mask_may_be_no_light():
@@ -138,8 +139,6 @@ def test_stored_values_stay_as_they_are():
         options=RecipeOptions(as_stored=True),
     )
     assert capture.removed_blur is None
-    np.testing.assert_allclose(capture.observations, images.reshape(8, -1).T, rtol=1e-5)
+    assert_allclose(capture.observations, images.reshape(8, -1).T, rtol=1e-5)
     sharpened = prepare_capture(open_arrays(images, lights, light_intensities=np.ones(8)))
-    np.testing.assert_allclose(
-        sharpened.observations.T.reshape(images.shape), removed(images)[0], atol=1e-4
-    )
+    assert_allclose(sharpened.observations.T.reshape(images.shape), removed(images)[0], atol=1e-4)

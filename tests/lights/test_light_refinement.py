@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from scenes import Floats
 from splinecli.capture import Capture
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.errors import UsageError
@@ -11,7 +11,7 @@ from splinecli.lights.light_fit import find_factors, refine_capture, refine_ligh
 from splinecli.maths.normals import angle_between_deg, unit
 
 
-def rough(lights: NDArray[np.float64], sigma_deg: float, seed: int = 0) -> NDArray[np.float64]:
+def rough(lights: Floats, sigma_deg: float, seed: int = 0) -> Floats:
     """Lights with Gaussian errors across each, whose angle has this root mean square."""
     errors = np.random.default_rng(seed).normal(
         scale=np.radians(sigma_deg) / np.sqrt(2), size=lights.shape
@@ -19,7 +19,7 @@ def rough(lights: NDArray[np.float64], sigma_deg: float, seed: int = 0) -> NDArr
     return unit(lights + errors - (errors * lights).sum(axis=1, keepdims=True) * lights)
 
 
-def aligned_error_deg(found: NDArray[np.float64], true: NDArray[np.float64]) -> float:
+def aligned_error_deg(found: Floats, true: Floats) -> float:
     """The mean angle after the best common rotation, which the images leave open."""
     u, _, v = np.linalg.svd(found.T @ true)
     rotation = u @ np.diag((1, 1, np.linalg.det(u @ v))) @ v

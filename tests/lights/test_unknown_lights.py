@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from scenes import cap_directions, ring_lights, shade, sphere, sphere_cap, square_grid
+from scenes import Floats, cap_directions, ring_lights, shade, sphere, sphere_cap, square_grid
 from splinecli import estimate_normals
 from splinecli.errors import InputError, UsageError
 from splinecli.estimate.confidence import add_common_error
@@ -25,11 +26,11 @@ SIZE = 64
 NORMALS, INSIDE = sphere(SIZE)
 
 
-def lights(count: int = 10, seed: int = 1) -> NDArray[np.float64]:
+def lights(count: int = 10, seed: int = 1) -> Floats:
     return cap_directions(count, 55, seed, even=True)
 
 
-def observed(directions: NDArray[np.float64], **gloss: float) -> NDArray[np.float32]:
+def observed(directions: Floats, **gloss: float) -> NDArray[np.float32]:
     return shade(NORMALS[INSIDE], directions, noise=0.002, **gloss).astype(np.float32)
 
 
@@ -39,7 +40,7 @@ def images_of(observations: NDArray[np.float32]) -> NDArray[np.float32]:
     return images
 
 
-def mean_angle(found: NDArray[np.float64], true: NDArray[np.float64]) -> float:
+def mean_angle(found: Floats, true: Floats) -> float:
     return float(angle_between_deg(found, true).mean())
 
 
@@ -51,7 +52,7 @@ def test_a_sphere(count, gloss):
     assert found.intensities is None
     assert mean_angle(found.directions, true) < 5
     assert mean_angle(found.directions, true) < 3 * found.errors_deg.mean()
-    np.testing.assert_allclose(np.linalg.norm(found.directions, axis=1), 1)
+    assert_allclose(np.linalg.norm(found.directions, axis=1), 1)
 
 
 def test_intensities_are_found_with_the_directions():
@@ -73,8 +74,8 @@ def test_the_number_of_threads_changes_nothing():
             found.append(find_lights(observed(lights()), INSIDE, True).directions)
     finally:
         torch.set_num_threads(before)
-    np.testing.assert_array_equal(found[1], found[0])
-    np.testing.assert_array_equal(found[2], found[0])
+    assert_array_equal(found[1], found[0])
+    assert_array_equal(found[2], found[0])
 
 
 def test_a_turned_camera_turns_the_lights():
@@ -152,8 +153,8 @@ def test_without_outline_the_first_light_decides_between_bump_and_hollow(hollow)
     with pytest.raises(
         InputError,
         match=(
-            r"a bump looks like a hollow .* add --auto-mask, or give its mask\. .*"
-            r" --first-light left"
+            r"a bump looks like a hollow .* add --auto-mask, or give its mask\. .* --first-light "
+            r"left"
         ),
     ):
         find_lights(images, everywhere, True)
@@ -184,7 +185,7 @@ def test_confidence_includes_the_lights():
     errors = np.array([[np.log(0.03), 1.0], [np.log(0.5), 1.0]], np.float32)
     add_common_error(errors, 3.0)
     turn = np.radians(3.0)
-    np.testing.assert_allclose(np.exp(errors[:, 0]), np.hypot((0.03, 0.5), turn), rtol=1e-5)
+    assert_allclose(np.exp(errors[:, 0]), np.hypot((0.03, 0.5), turn), rtol=1e-5)
 
 
 def test_python():
@@ -206,7 +207,7 @@ def test_python():
             estimate_normals(images, lights_given, INSIDE, **options)
 
 
-Array = NDArray[np.float64]
+Array = Floats
 
 OPPOSITE = (-1, -1, 1)
 
@@ -276,4 +277,4 @@ def test_high_lights_are_not_lowered():
     normals, inside = sphere(64)
     lights = ring_lights(8, 30)
     images = shade(normals[inside], lights).astype(np.float32)
-    np.testing.assert_array_equal(lower_lights(images, lights, 10.0), lights)
+    assert_array_equal(lower_lights(images, lights, 10.0), lights)

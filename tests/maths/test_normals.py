@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from scenes import square_grid
@@ -24,7 +25,7 @@ def random_normals(count: int, seed: int = 0) -> NDArray[np.float64]:
 
 def test_unit_keeps_directions_and_zero_vectors():
     scaled = unit(np.array([[3.0, 0.0, 4.0], [0.0, 0.0, 0.0], [0.0, -1e-30, 0.0]]))
-    np.testing.assert_allclose(scaled, [[0.6, 0, 0.8], [0, 0, 0], [0, -1, 0]], rtol=1e-15)
+    assert_allclose(scaled, [[0.6, 0, 0.8], [0, 0, 0], [0, -1, 0]], rtol=1e-15)
 
 
 # A step of 1 / 65535 in (n + 1) / 2 is off by at most 1 / 65535 in each component of n, sqrt(3) of
@@ -45,15 +46,15 @@ def test_known_colours():
     picture = encode_picture(normals, np.array([[True, True, True]]), bits=8)
     # 127.5 rounds to the even 128; 1.6 / 2 * 255 = 204; 1.8 / 2 * 255 = 229.5 rounds to 230 (229.5
     # is exact).
-    np.testing.assert_array_equal(picture, [[[128, 128, 255], [255, 128, 128], [128, 204, 230]]])
+    assert_array_equal(picture, [[[128, 128, 255], [255, 128, 128], [128, 204, 230]]])
 
 
 def test_directx_flips_green_alone():
     normals, mask = random_normals(64).reshape(8, 8, 3), np.ones((8, 8), bool)
     flipped = encode_picture(normals, mask, convention="directx")
-    np.testing.assert_array_equal(flipped, encode_picture(normals * (1, -1, 1), mask))
+    assert_array_equal(flipped, encode_picture(normals * (1, -1, 1), mask))
     opengl = encode_picture(normals, mask)
-    np.testing.assert_array_equal(flipped[..., [0, 2]], opengl[..., [0, 2]])
+    assert_array_equal(flipped[..., [0, 2]], opengl[..., [0, 2]])
     # Green runs the other way: the two add up to full scale, but for rounding.
     assert np.abs(flipped[..., 1].astype(int) + opengl[..., 1] - 65535).max() <= 1
 
@@ -66,7 +67,7 @@ def test_black_outside_the_mask_and_zero_when_read_back(convention):
     assert not picture[~mask].any()
     decoded = decode_picture(picture)
     assert not decoded[~mask].any()
-    np.testing.assert_allclose(np.linalg.norm(decoded[mask], axis=1), 1)
+    assert_allclose(np.linalg.norm(decoded[mask], axis=1), 1)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1e-7, 1e-3, 45.0, 90.0, 179.999, 180 - 1e-7, 180.0])
@@ -92,7 +93,7 @@ def test_black_and_mid_gray_are_no_normals(dtype):
     picture = np.array([[0, 0, 0], [half] * 3, [half + 1] * 3, [half, half, top]], dtype)
     decoded = decode_picture(picture)
     assert not decoded[:3].any()
-    np.testing.assert_allclose(decoded[3], [0, 0, 1], atol=0.01)
+    assert_allclose(decoded[3], [0, 0, 1], atol=0.01)
 
 
 def tilted(degrees: float) -> list[float]:
@@ -104,7 +105,7 @@ def test_error_map():
     normals = np.array([[tilted(30), [0, 0, -1], [0, 0, 1], [0, 0, 1]]], np.float32)
     errors = angular_error_map_deg(normals, truth, np.array([[True, True, True, False]]))
     # Right by definition; flipped is 180, not 0; no truth; outside the mask.
-    np.testing.assert_allclose(errors, [[30, 180, np.nan, np.nan]], atol=1e-5)
+    assert_allclose(errors, [[30, 180, np.nan, np.nan]], atol=1e-5)
 
 
 def test_summary_of_a_known_list():
@@ -147,12 +148,10 @@ def test_a_sphere(sign):
     normal_map, mask = sphere(sign)
     found = curvature_of_normals(normal_map, mask)
     expected = np.tile((sign / RADIUS, 1 / RADIUS**2), (len(found[mask]), 1))
-    np.testing.assert_allclose(found[mask], expected, rtol=0.02)
+    assert_allclose(found[mask], expected, rtol=0.02)
     assert np.isnan(found[~mask]).all()
     slopes = gradient_of_normals(normal_map, mask)
-    np.testing.assert_allclose(
-        slopes[mask], -normal_map[mask][:, :2] / normal_map[mask][:, 2:], rtol=1e-5
-    )
+    assert_allclose(slopes[mask], -normal_map[mask][:, :2] / normal_map[mask][:, 2:], rtol=1e-5)
 
 
 def test_a_cylinder_and_a_saddle():
@@ -161,8 +160,8 @@ def test_a_cylinder_and_a_saddle():
     cylinder = curvature_of_normals(normals(-X / np.sqrt(RADIUS**2 - X**2), 0 * X), everywhere)[
         inner
     ]
-    np.testing.assert_allclose(cylinder[:, 0], 0.5 / RADIUS, rtol=0.02)
-    np.testing.assert_allclose(cylinder[:, 1], 0, atol=1e-6)
+    assert_allclose(cylinder[:, 0], 0.5 / RADIUS, rtol=0.02)
+    assert_allclose(cylinder[:, 1], 0, atol=1e-6)
     # z = x y / R, whose curvature at the middle is -1/R^2 (Gauss) and 0 (mean).
     saddle = curvature_of_normals(normals(Y / 300, X / 300), everywhere)[SIZE // 2, SIZE // 2]
     assert saddle[1] == pytest.approx(-1 / 300**2, rel=0.02) and abs(saddle[0]) < 1e-6

@@ -9,7 +9,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
+from torch.testing import assert_close
 
+from distributions import seeded
 from splinecli.maths.observation_map import (
     cell_directions,
     light_cells,
@@ -27,7 +29,7 @@ def random_rig(seed: int, pixels: int, lights: int) -> tuple[Tensor, Tensor]:
     """Observations (P, F) and shared directions (F, 3) in float64: no light falls on the border of
     a cell.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     directions = torch.randn(lights, 3, generator=generator, dtype=torch.float64)
     directions[:, 2] = directions[:, 2].abs() + 0.05
     observations = torch.rand(pixels, lights, generator=generator, dtype=torch.float64)
@@ -104,7 +106,7 @@ def test_lights_in_one_cell_are_averaged():
     )
     values = torch.tensor([[[1.0, 10.0], [0.0, 20.0], [0.5, 60.0], [0.3, 7.0]]])
     maps = sparse_map(values, directions)
-    torch.testing.assert_close(maps.values[0, :, 15, 16], torch.tensor([0.5, 30.0]))
+    assert_close(maps.values[0, :, 15, 16], torch.tensor([0.5, 30.0]))
     assert maps.occupied.sum() == 2
     assert maps.occupied[0, 0, 15, 16] == 1
 
@@ -114,7 +116,7 @@ def test_lights_that_are_not_valid_leave_no_trace():
     valid = torch.arange(12) % 3 != 0
     with_flags = sparse_map(observations, directions, valid.expand(3, 12))
     without = sparse_map(observations[:, valid], directions[valid])
-    torch.testing.assert_close(with_flags.values, without.values)
+    assert_close(with_flags.values, without.values)
     assert torch.equal(with_flags.occupied, without.occupied)
     bright = torch.where(valid, observations, 100.0)
     assert torch.equal(map_scale(bright, valid.expand(3, 12)), map_scale(observations[:, valid]))
@@ -141,10 +143,10 @@ SYMMETRIES = {
 def test_maps_follow_the_lights(name, seed):
     change, changed = SYMMETRIES[name]
     observations, directions = random_rig(seed, 3, 20)
-    order = torch.randperm(20, generator=torch.Generator().manual_seed(seed))
+    order = torch.randperm(20, generator=seeded(seed))
     one, other = (
         sparse_map(observations, directions),
         sparse_map(observations[:, order], change(directions)[order]),
     )
-    torch.testing.assert_close(other.values, changed(one.values))
+    assert_close(other.values, changed(one.values))
     assert torch.equal(other.occupied, changed(one.occupied))

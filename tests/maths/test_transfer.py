@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
@@ -20,12 +21,7 @@ from scenes import with_chunk
 from splinecli.capture import open_capture
 from splinecli.capture.formats.facts import StatedCurve, read_header
 from splinecli.errors import UsageError
-from splinecli.maths.transfer import (
-    decode_transfer,
-    encode_srgb,
-    parse_transfer,
-    profile_curve,
-)
+from splinecli.maths.transfer import decode_transfer, encode_srgb, parse_transfer, profile_curve
 from splinecli.recipe import read_capture
 
 SRGB_PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
@@ -113,7 +109,7 @@ def test_curves_with_a_name(icc, expected):
 def test_curves_without_a_name(curve, expected):
     found = profile_curve(profile(curve))
     assert found is not None and isinstance(found[1], tuple)
-    np.testing.assert_allclose(decode_transfer(STORED, found[1]), expected(STORED), atol=2e-4)
+    assert_allclose(decode_transfer(STORED, found[1]), expected(STORED), atol=2e-4)
 
 
 @pytest.mark.parametrize(
@@ -184,7 +180,7 @@ def test_a_capture_is_read_with_the_curve_of_its_profile(tmp_path, suffix):
     plain = read_capture(capture(tmp_path / "plain", None, PIXELS, suffix), as_stored=True)
     np.testing.assert_array_equal(linear.observations, plain.observations)
     expected = np.mean((PIXELS.reshape(-1, 3) / 65535) ** 2.1992, axis=1)
-    np.testing.assert_allclose(found.observations[:, 0], expected, rtol=1e-5)
+    assert_allclose(found.observations[:, 0], expected, rtol=1e-5)
     (told,) = [str(warning) for warning in found.warnings if warning.code == "display_decoded"]
     assert (
         '(colour profile "Adobe RGB (1998)") and are read as gamma:2.1992. Add --transfer linear'
@@ -231,7 +227,7 @@ def test_decoding_turns_encoding_back():
         encode_srgb(decode_transfer((codes / 255).astype(np.float32), None)).tolist()
         == codes.tolist()
     )
-    np.testing.assert_allclose(decode_transfer(np.float32([0.25, 0.5]), 2.0), [0.0625, 0.25])
+    assert_allclose(decode_transfer(np.float32([0.25, 0.5]), 2.0), [0.0625, 0.25])
 
 
 def test_names_of_curves():

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
 from scenes import decode_rgb
@@ -64,7 +65,7 @@ def test_png_keeps_every_value(monkeypatch):
             0, np.iinfo(dtype).max, shape, dtype, endpoint=True
         )
         stored = cv2.imdecode(np.frombuffer(encode_png(picture), np.uint8), cv2.IMREAD_UNCHANGED)
-        np.testing.assert_array_equal(stored if picture.ndim == 2 else stored[..., ::-1], picture)
+        assert_array_equal(stored if picture.ndim == 2 else stored[..., ::-1], picture)
     monkeypatch.setattr(cv2, "imencode", lambda *_: (False, np.empty(0, np.uint8)))
     with pytest.raises(OutputError, match="cannot be encoded as PNG"):
         encode_png(np.zeros((2, 2), np.uint8))
@@ -90,11 +91,11 @@ def test_a_small_map_is_enlarged_pixel_by_pixel_and_a_large_one_keeps_its_pixels
     assert picture.dtype == np.uint8 and picture.shape[0] == 300
     square = np.zeros((300, 250), bool)
     square[50:100, 150:200] = True
-    np.testing.assert_array_equal((picture[:, :250] != 255).any(axis=2), square)
+    assert_array_equal((picture[:, :250] != 255).any(axis=2), square)
     errors = np.random.default_rng(0).uniform(0, 60, (400, 300)).astype(np.float32)
     picture = error_map_picture(errors)
     assert picture.shape[0] == 400
-    np.testing.assert_array_equal(picture[:, :300], colour_errors(errors))
+    assert_array_equal(picture[:, :300], colour_errors(errors))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (10, 2000), (2000, 10), (256, 256)])
@@ -106,9 +107,7 @@ def test_the_bar_runs_from_0_to_the_top(shape):
     bar = picture[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     assert len(bar) > 200
     assert bar.shape[1] >= 18
-    np.testing.assert_array_equal(
-        bar[:, 0], colour_errors(np.linspace(TOP_DEG, 0, len(bar))[:, None])[:, 0]
-    )
+    assert_array_equal(bar[:, 0], colour_errors(np.linspace(TOP_DEG, 0, len(bar))[:, None])[:, 0])
     # Text: black ink right of the bar, and none cut at the picture's edges.
     right = picture[:, columns[-1] + 1 :]
     assert (right < 64).all(axis=2).sum() > 200
@@ -244,8 +243,8 @@ def test_nothing_is_cut_at_the_edges_and_the_bar_runs_over_the_whole_scale():
     for error_deg in (0.0, TOP_DEG / 2, TOP_DEG):
         assert (picture == error_colour(error_deg)).all(axis=2).sum() >= 10
     long = (
-        "a capture with quite a long name, 10 lights, draw 1 of 10, seed 0, light noise of 2"
-        " degrees $x$"
+        "a capture with quite a long name, 10 lights, draw 1 of 10, seed 0, light noise of 2 "
+        "degrees $x$"
     )
     for methods in (["ls"], ["a method with a long name", "b"]):
         picture = draw(20, 30, methods, title=long)
@@ -255,11 +254,7 @@ def test_nothing_is_cut_at_the_edges_and_the_bar_runs_over_the_whole_scale():
 
 SIZE = 8
 # viridis' ends; 0.85 of 255
-CELL_YELLOW, CELL_VIOLET, GRAY = (
-    (253, 231, 36),
-    (68, 1, 84),
-    (217, 217, 217),
-)
+CELL_YELLOW, CELL_VIOLET, GRAY = ((253, 231, 36), (68, 1, 84), (217, 217, 217))
 
 
 @cache

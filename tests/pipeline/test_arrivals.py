@@ -69,9 +69,7 @@ def test_the_files_of_a_capture_that_is_done_are_left_alone(tmp_path, monkeypatc
     assert arrivals.take() == [done]
 
 
-def test_two_at_once_come_in_natural_order_and_one_that_vanishes_is_forgotten(
-    tmp_path,
-):
+def test_two_at_once_come_in_natural_order_and_one_that_vanishes_is_forgotten(tmp_path):
     arrivals = Arrivals(tmp_path, marker=None, seconds=0, without=tmp_path / "out")
     put(tmp_path / "part10/1.png")
     put(tmp_path / "part9/1.png")

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import worker_tasks
-from scenes import write_capture
+from scenes import read_json, write_capture
 from splinecli.cli.main import main
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
 from splinecli.maths.normals import unit
@@ -281,7 +281,7 @@ def test_trials_on_workers(cluster, tmp_path, monkeypatch, capfd):
 
     def results(output, *more):
         assert main([*call, "-o", output, *more]) == 3
-        document = json.loads(Path(output, "results.json").read_text())
+        document = read_json(Path(output, "results.json"))
         text = re.sub(r'"seconds[a-z_]*": [0-9.e-]+', "", json.dumps(document))
         return text, capfd.readouterr().err, Path(output, "trials.jsonl").read_text().count("\n")
 

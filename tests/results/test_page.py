@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from browser import OpenPage
 from html_page import REPORT, SIDE, HtmlPage, ball, light_at
-from scenes import decode_rgb
+from scenes import decode_rgb, write_image
 from splinecli.evaluation.document import html_report
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 from splinecli.materials.lobes import GGX, Geometry, diffuse_lobe, facet_lobe
@@ -416,7 +416,7 @@ def test_pictures_of_earlier_results_that_are_none_of_ours_are_not_shown(tmp_pat
     folder.mkdir()
     entry = Entry(Row("other"), (NORMALS["png"],))
     picture = folder / NORMALS["png"]
-    cv2.imwrite(str(picture), np.full((9, 9, 3), 200, np.uint8))
+    write_image(picture, np.full((9, 9, 3), 200, np.uint8))
     assert "data:image/jpeg" in index_page([entry], tmp_path)
     content = bytearray(picture.read_bytes())
     content[16:24] = (20_000).to_bytes(4, "big") * 2  # the size, in a file of few bytes

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from html_page import REPORT, SIDE, ball, light_at
 from splinecli.results import pages as page_module
@@ -18,9 +19,7 @@ def wait_until(page: Any, condition: str) -> None:
 
 
 def lights_are(page: Any, x: float, y: float, note: str) -> None:
-    np.testing.assert_allclose(
-        page.evaluate("splinecli.light"), light_at(x, y), atol=0.02, err_msg=note
-    )
+    assert_allclose(page.evaluate("splinecli.light"), light_at(x, y), atol=0.02, err_msg=note)
 
 
 @pytest.mark.parametrize("webgl", [True, False])
@@ -67,20 +66,18 @@ def test_mouse_keys_and_a_narrow_screen(open_page, webgl):
     page.mouse.wheel(0, -300)
     wait_until(page, "splinecli.region[2] < 200")
     left, top, width, height = page.evaluate("splinecli.region")
-    np.testing.assert_allclose((left, top, width, height), (32, 64, 128, 128), atol=1)
+    assert_allclose((left, top, width, height), (32, 64, 128, 128), atol=1)
     # The picture follows the drag, an eighth of the view to the left and a quarter up; the light
     # stays.
     page.mouse.down()
     page.mouse.move(*at(-0.75, 0.5), steps=3)
     page.mouse.up()
-    np.testing.assert_allclose(
-        page.evaluate("splinecli.region"), (32 + 16, 64 + 32, 128, 128), atol=2
-    )
+    assert_allclose(page.evaluate("splinecli.region"), (32 + 16, 64 + 32, 128, 128), atol=2)
     lights_are(page, 0.3, 0.3, "dragged")
     page.keyboard.press("Shift+ArrowLeft")
-    np.testing.assert_allclose(page.evaluate("splinecli.region")[0], 48 - 12.8, atol=2)
+    assert_allclose(page.evaluate("splinecli.region")[0], 48 - 12.8, atol=2)
     page.keyboard.press("+")
-    np.testing.assert_allclose(page.evaluate("splinecli.region")[2], 128 / 1.25, atol=1)
+    assert_allclose(page.evaluate("splinecli.region")[2], 128 / 1.25, atol=1)
     page.keyboard.press("0")
     assert page.evaluate("splinecli.region") == [0, 0, SIDE, SIDE]
     page.evaluate("splinecli.show(1e9, -50, 1e9)")
@@ -119,7 +116,7 @@ def test_fingers(open_page):
     assert page.evaluate("splinecli.light") == lights
     # The fingers are twice as far apart, and what was between them, the middle, is a tenth of the
     # view higher.
-    np.testing.assert_allclose(page.evaluate("splinecli.region"), (64, 76.8, 128, 128), atol=2)
+    assert_allclose(page.evaluate("splinecli.region"), (64, 76.8, 128, 128), atol=2)
     touch("touchEnd")
 
 

@@ -4,16 +4,17 @@ import re
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label
 
+from scenes import Floats
 from splinecli.errors import InputError, UsageError
 from splinecli.maths.normals import unit
 from splinecli.surface import integration
 from splinecli.surface.bilateral_equations import CONTRADICTION
 from splinecli.surface.integration import integrate_normals, relief_of_normals
 
-Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 CAMERA = np.array([[210.0, 0.0, 63.0], [0.0, 200.0, 41.0], [0.0, 0.0, 1.0]])
 # Maps of more pixels than this start from coarser ones.
@@ -139,7 +140,7 @@ def test_plane_is_exact(shape, slopes):
     # As float32 slopes of s have errors of s^2 * 1e-7, over 90 pixels.
     for dtype, atol in ((np.float32, 3e-3), (np.float64, 1e-4)):
         found = integrate_normals(normals.astype(dtype), mask)
-        np.testing.assert_allclose(found, slopes[0] * x + slopes[1] * y, atol=atol, rtol=0)
+        assert_allclose(found, slopes[0] * x + slopes[1] * y, atol=atol, rtol=0)
 
 
 def seen(camera: Floats, height: int, width: int) -> Floats:
@@ -161,9 +162,9 @@ def test_perspective_plane():
     found = integrate_normals(normals, mask, camera_matrix=CAMERA)
     # A step of log(depth) is not quite linear in its slope.
     assert error_share(found, depth, mask) < 5e-4
-    np.testing.assert_allclose(found, depth, rtol=1e-3)
+    assert_allclose(found, depth, rtol=1e-3)
     # A prior gives depths their scale.
-    np.testing.assert_allclose(
+    assert_allclose(
         integrate_normals(normals, mask, CAMERA, prior=500 * depth), 500 * depth, rtol=1e-3
     )
 
@@ -232,7 +233,7 @@ def dense(normals: Floats, mask: Mask, discontinuity: float, iterations: int) ->
 def test_least_squares_is_the_dense_solution():
     normals, mask = bumps(14, 19, usable=True), holes(14, 19)
     found = integrate_normals(normals, mask, discontinuity=0)[mask]
-    np.testing.assert_allclose(found, dense(normals, mask, 0, 1), atol=1e-4)
+    assert_allclose(found, dense(normals, mask, 0, 1), atol=1e-4)
 
 
 def test_a_prior_is_the_dense_solution():
@@ -250,9 +251,9 @@ def test_a_prior_is_the_dense_solution():
     expected = np.linalg.lstsq(rows, values)[0]
     parts = label(mask)[0][mask]
     reached = np.isin(parts, parts[known])
-    np.testing.assert_allclose(found[reached], expected[reached], atol=1e-4)
+    assert_allclose(found[reached], expected[reached], atol=1e-4)
     means = [found[parts == part].mean() for part in np.unique(parts[~reached])]
-    np.testing.assert_allclose(means, prior[mask][known].mean(), atol=1e-9)
+    assert_allclose(means, prior[mask][known].mean(), atol=1e-9)
 
 
 def drifting(seed: int = 0) -> tuple[Floats, Floats, Floats]:
@@ -306,7 +307,7 @@ def test_bilateral_is_the_dense_solution():
     least_squares = dense(normals, mask, 0, 1)
     expected = dense(normals, mask, 2, 200)
     assert np.abs(expected - least_squares).max() > 0.5
-    np.testing.assert_allclose(found, expected, atol=5e-3)
+    assert_allclose(found, expected, atol=5e-3)
 
 
 @pytest.mark.usefixtures("any_scale")
@@ -322,7 +323,7 @@ def test_single_pixels_and_normals_that_are_not_usable(camera):
         found = integrate_normals(some, mask, camera_matrix=camera)
         assert np.isfinite(found[mask]).all()
         assert found[3, 4] == pytest.approx(middle, abs=1e-9)
-    np.testing.assert_allclose(found[mask], middle, atol=1e-9)
+    assert_allclose(found[mask], middle, atol=1e-9)
 
 
 @pytest.mark.usefixtures("any_scale")
@@ -340,7 +341,7 @@ def test_turning_the_picture_turns_the_surface():
     x, y, z = np.moveaxis(normals, -1, 0)
     found = integrate_normals(normals, mask)
     again = integrate_normals(np.rot90(np.stack((-y, x, z), axis=-1)), np.rot90(mask))
-    np.testing.assert_allclose(again, np.rot90(found), atol=5e-3)
+    assert_allclose(again, np.rot90(found), atol=5e-3)
 
 
 def test_without_a_mask_all_normals_count_and_progress_is_reported():
@@ -428,4 +429,4 @@ def test_of_a_wave_the_stated_share_is_kept(wave, kept):
     normals = normals_of_slopes(-0.5 * k * np.sin(k * x), 0.0 * x).astype(np.float32)
     relief = relief_of_normals(normals, np.ones(x.shape, bool))
     middle = (slice(None), slice(128, 384))
-    np.testing.assert_allclose(relief[middle], 0.5 * kept * np.cos(k * x)[middle], atol=0.01)
+    assert_allclose(relief[middle], 0.5 * kept * np.cos(k * x)[middle], atol=0.01)

@@ -4,15 +4,14 @@ import json
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from scenes import Floats, read_json
 from splinecli.errors import UsageError
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.pipeline.integrate import integrate_normal_map
 from splinecli.pipeline.options import IntegrateOptions, parse_level
 from splinecli.surface.levelling import level_heights, level_normals, plane_slopes
 
-Floats = NDArray[np.float64]
 SLOPES = 0.2, -0.1
 MASK = np.ones((60, 80), np.bool_)
 
@@ -53,7 +52,7 @@ def test_integrate_levels_depth_and_normals(tmp_path):
         formats=("npy", "ply"),
     )
     report = integrate_normal_map(options)
-    assert json.loads(json.dumps(report)) == json.loads((tmp_path / "surface.json").read_text())
+    assert json.loads(json.dumps(report)) == read_json(tmp_path / "surface.json")
     assert report["level"]["tilt_deg"] == pytest.approx(
         np.degrees(np.arctan(np.hypot(*SLOPES))), abs=0.3
     )

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scenes import directions_at, shade, sphere
+from scenes import Floats, directions_at, shade, sphere
 from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.film import (
     FEWEST_FRAMES,
@@ -27,12 +27,12 @@ from splinecli.pictures.maps import encode_png
 SIZE = 96
 
 
-def encode_bt709(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+def encode_bt709(linear: Floats) -> Floats:
     """The curve of ITU-R BT.709, from its text."""
     return np.where(linear < 0.018, 4.5 * linear, 1.099 * np.maximum(linear, 1e-9) ** 0.45 - 0.099)
 
 
-def sphere_film(lights: NDArray[np.float64], texture: float = 0.3) -> NDArray[np.uint8]:
+def sphere_film(lights: Floats, texture: float = 0.3) -> NDArray[np.uint8]:
     """Frames (F, SIZE, SIZE) of a matte sphere with fine texture, under lights (F, 3),
     with noise.
     """
@@ -53,7 +53,7 @@ def write_film(path: Path, frames: NDArray[np.uint8], codec: str = "MJPG") -> Pa
     return path
 
 
-def path_of_lamp(count: int) -> NDArray[np.float64]:
+def path_of_lamp(count: int) -> Floats:
     """Lights (count, 3) along a slow spiral, as a lamp is carried."""
     return directions_at(np.linspace(0, 6 * np.pi, count), np.radians(np.linspace(15, 50, count)))
 

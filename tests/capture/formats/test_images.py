@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageFile
 from PIL.TiffImagePlugin import IFDRational
 
@@ -43,7 +44,7 @@ def test_integers_are_scaled_by_their_full_range(write_image, name, stored):
     image = read_image(write_image(name, stored))
     assert image.dtype == np.float32
     full = np.float32(np.iinfo(stored.dtype).max)
-    np.testing.assert_array_equal(image, stored.reshape(7, 9, -1).astype(np.float32) / full)
+    assert_array_equal(image, stored.reshape(7, 9, -1).astype(np.float32) / full)
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
@@ -52,7 +53,7 @@ def test_floating_point_tiff_is_kept(tmp_path, dtype, channels):
     stored = RNG.uniform(0, 5, (7, 9, channels)).astype(dtype)
     photometric = "rgb" if channels == 3 else "minisblack"
     tifffile.imwrite(tmp_path / "a.tif", stored.squeeze(), photometric=photometric)
-    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), stored.astype(np.float32))
+    assert_array_equal(read_image(tmp_path / "a.tif"), stored.astype(np.float32))
 
 
 @pytest.mark.parametrize(
@@ -67,7 +68,7 @@ def test_floating_point_tiff_is_kept(tmp_path, dtype, channels):
 )
 def test_kinds_of_tiff(tmp_path, options):
     tifffile.imwrite(tmp_path / "a.tif", RGB16, photometric="rgb", **options)
-    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), RGB16 / np.float32(65535))
+    assert_array_equal(read_image(tmp_path / "a.tif"), RGB16 / np.float32(65535))
 
 
 def test_planar_and_white_is_zero_tiff_and_alpha(tmp_path):
@@ -78,11 +79,9 @@ def test_planar_and_white_is_zero_tiff_and_alpha(tmp_path):
     cv2.imwrite(str(tmp_path / "alpha.png"), bgra)
     cv2.imwrite(str(tmp_path / "alpha.tif"), bgra)
     for name in ("a.tif", "alpha.png", "alpha.tif"):
-        np.testing.assert_array_equal(read_image(tmp_path / name), RGB16 / np.float32(65535))
+        assert_array_equal(read_image(tmp_path / name), RGB16 / np.float32(65535))
     tifffile.imwrite(tmp_path / "w.tif", 255 - RGB8[..., 0], photometric="miniswhite")
-    np.testing.assert_array_equal(
-        read_image(tmp_path / "w.tif")[..., 0], RGB8[..., 0] / np.float32(255)
-    )
+    assert_array_equal(read_image(tmp_path / "w.tif")[..., 0], RGB8[..., 0] / np.float32(255))
 
 
 def test_jpeg_channels_and_exif_orientation(write_image):
@@ -95,15 +94,11 @@ def test_jpeg_channels_and_exif_orientation(write_image):
     exif = b"Exif\0\0II*\0" + struct.pack("<IHHHII", 8, 1, 0x112, 3, 1, 6) + b"\0" * 4
     path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:])
     # the segment works: by default OpenCV turns the image
-    assert cv2.imread(str(path)).shape == (
-        32,
-        16,
-        3,
-    )
+    assert cv2.imread(str(path)).shape == (32, 16, 3)
     image = read_image(path)
     assert image.shape == (16, 32, 3)
     apart = np.r_[:14, 18:32]  # the chroma is subsampled, so the colours mix where they meet
-    np.testing.assert_allclose(image[:, apart], stored[:, apart] / 255, atol=0.05)  # JPEG's loss
+    assert_allclose(image[:, apart], stored[:, apart] / 255, atol=0.05)  # JPEG's loss
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif", "deflate.tif", "lzw.tif"])
@@ -123,8 +118,8 @@ def test_truncated_and_damaged_images(tmp_path, write_image, capfd, name):
     for content in contents:
         path.write_bytes(content)
         message = (
-            r"is (truncated|damaged (and cannot be read|\(a checksum is wrong\)))\."
-            r" Copy or export it again\."
+            r"is (truncated|damaged (and cannot be read|\(a checksum is wrong\)))\. Copy or export "
+            r"it again\."
         )
         with pytest.raises(InputError, match=message) as caught:
             read_image(path)
@@ -137,7 +132,7 @@ def test_the_c_library_is_silent_and_gamma_is_not_applied(write_image, capfd):
     data = path.read_bytes()
     data = with_chunk(data, b"iCCP", b"x\0\0" + zlib.compress(b"no profile"))
     path.write_bytes(with_chunk(data, b"gAMA", struct.pack(">I", 45455)))
-    np.testing.assert_array_equal(read_image(path), RGB16 / np.float32(65535))
+    assert_array_equal(read_image(path), RGB16 / np.float32(65535))
     assert capfd.readouterr() == ("", "")
     cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     # libpng does complain of this file when nobody holds its mouth
@@ -189,7 +184,7 @@ def test_mask(write_image):
     ):
         mask = read_mask(write_image("mask.png", stored))
         assert mask.dtype == np.bool_
-        np.testing.assert_array_equal(mask, expected)
+        assert_array_equal(mask, expected)
 
 
 CUT_OUT = np.array([[0, 0, 255], [0, 200, 255]], np.uint8)
@@ -202,13 +197,13 @@ def test_a_cut_out_is_a_mask_whatever_its_colours(tmp_path, name, colour):
         cv2.imwrite(
             str(tmp_path / name), np.dstack([np.full_like(alpha, colour * scale)] * 3 + [alpha])
         )
-        np.testing.assert_array_equal(read_mask(tmp_path / name), CUT_OUT > 127)
+        assert_array_equal(read_mask(tmp_path / name), CUT_OUT > 127)
     # Alpha that cuts nothing out leaves the mask to the colours.
     for nothing in (np.full((2, 3), 255), np.zeros((2, 3)), [[255, 254, 255], [250, 255, 255]]):
         cv2.imwrite(
             str(tmp_path / name), np.dstack([CUT_OUT] * 3 + [np.asarray(nothing, np.uint8)])
         )
-        np.testing.assert_array_equal(read_mask(tmp_path / name), CUT_OUT > 127)
+        assert_array_equal(read_mask(tmp_path / name), CUT_OUT > 127)
 
 
 RGB = np.random.default_rng(0).integers(0, 256, (7, 5, 3), np.uint8)
@@ -223,7 +218,7 @@ def test_pixels(tmp_path, suffix, options, mode, channels):
     picture.save(tmp_path / f"image{suffix}", **options)
     path = tmp_path / f"image{suffix}"
     expected = np.asarray(picture.convert("RGB" if mode == "P" else mode)).reshape(7, 5, channels)
-    np.testing.assert_array_equal(decode_image(path), expected)
+    assert_array_equal(decode_image(path), expected)
     facts = read_header(path)
     assert (
         facts.size == ((7, 5, channels), 1) and facts.curve.curve == 1 and facts.white_level is None
@@ -309,14 +304,14 @@ def test_mixed_exposures_are_divided_out(tmp_path):
     for options in ({}, {"intensities": "equal"}):  # equal lamps do not make equal exposures
         source = open_capture(folder, **options)
         # The third image got twice the light of the others; the mean is 4 / 3.
-        np.testing.assert_allclose(source.light_intensities[:, 1], [0.75, 0.75, 1.5])
+        assert_allclose(source.light_intensities[:, 1], [0.75, 0.75, 1.5])
         assert (source.intensities_known, source.intensities_measured) == (bool(options), False)
         assert source.warnings[0].code == "exif_exposure"
         assert "from 1/60 s, f/8, ISO 100 to 1/30 s, f/8, ISO 100." in str(source.warnings[0])
     write(folder / "1.jpg", None)
     message = (
-        r"2\.jpg: found an exposure of 1/30 s, f/8, ISO 100, expected 1/60 s,"
-        r" f/8, ISO 100 as in 0\.jpg"
+        r"2\.jpg: found an exposure of 1/30 s, f/8, ISO 100, expected 1/60 s, f/8, ISO 100 as in "
+        r"0\.jpg"
     )
     with pytest.raises(InputError, match=message):
         open_capture(folder)

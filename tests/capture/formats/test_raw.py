@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from splinecli.capture import open_capture
@@ -151,11 +152,9 @@ def test_values_are_proportional_to_light(tmp_path, black):
     # The borders of a bilinear interpolation are no ramp. Rounding on the sensor is 1/2 of 16383,
     # and its full scale is that of the highest black level: half a thousandth.
     inner = (slice(2, -2), slice(2, -2))
-    np.testing.assert_allclose(
-        once[inner] / 65535, light[inner][..., None] * np.ones(3), rtol=1e-3, atol=1e-4
-    )
+    assert_allclose(once[inner] / 65535, light[inner][..., None] * np.ones(3), rtol=1e-3, atol=1e-4)
     bright = once[inner] > 2000
-    np.testing.assert_allclose(twice[inner][bright] / once[inner][bright], 2, rtol=0.01)
+    assert_allclose(twice[inner][bright] / once[inner][bright], 2, rtol=0.01)
 
 
 @pytest.mark.usefixtures("needs_rawpy")
@@ -196,11 +195,11 @@ def test_channels_are_red_green_blue_of_the_camera_and_sensors_without_bayer_fil
     light = np.broadcast_to(colour, (30, 40, len(colour)))
     pixels = decode_image(write_dng(tmp_path / "a.dng", np.round(light * WHITE)))
     assert pixels.shape == light.shape
-    np.testing.assert_allclose(pixels / 65535, light, atol=1e-4)
+    assert_allclose(pixels / 65535, light, atol=1e-4)
     filtered = decode_image(
         write_dng(tmp_path / "b.dng", mosaic(np.broadcast_to(colour, (30, 40, 3))))
     )
-    np.testing.assert_allclose(filtered[10, 10] / 65535, np.broadcast_to(colour, 3), atol=1e-4)
+    assert_allclose(filtered[10, 10] / 65535, np.broadcast_to(colour, 3), atol=1e-4)
 
 
 @pytest.mark.usefixtures("without_rawpy")

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from scenes import png_chunk
+from scenes import png_chunk, write_image
 from splinecli.capture import open_capture
 from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.images import check_stored_size, decode_image
@@ -32,8 +32,8 @@ from splinecli.recipe import RecipeOptions, prepare_capture
 HUGE = 30_000
 SMALL = (16, 18)
 TOO_LARGE = (
-    r"(30|21)000 x (30|21)000 pixels, which takes \d+\.\d GB of memory;"
-    r" expected at most 400 megapixels"
+    r"(30|21)000 x (30|21)000 pixels, which takes \d+\.\d GB of memory; expected at most 400 "
+    r"megapixels"
 )
 MOST_GROWTH = 300 * 2**20
 
@@ -42,7 +42,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="measures memory
 
 def write_claim(path: Path, height: int, width: int) -> None:
     """A PNG that states a size and has no pixels. Whoever decodes it finds it damaged."""
-    cv2.imwrite(str(path), np.zeros(SMALL, np.uint8))
+    write_image(path, np.zeros(SMALL, np.uint8))
     content = path.read_bytes()
     header = struct.pack(">II", width, height) + content[24:29]
     path.write_bytes(content[:8] + png_chunk(b"IHDR", header) + png_chunk(b"IEND", b""))
@@ -131,7 +131,7 @@ def test_images_of_another_size_than_others_are_not_decoded(tmp_path):
     for folder in (ball, capture):
         folder.mkdir()
         for number in range(4):
-            cv2.imwrite(str(folder / f"{number}.png"), np.full(SMALL, 9 + number, np.uint8))
+            write_image(folder / f"{number}.png", np.full(SMALL, 9 + number, np.uint8))
     np.savetxt(capture / "lights.txt", [(0, 0, 1), (1, 0, 1), (0, 1, 1), (1, 1, 2)])
     write_claim(tmp_path / "large.png", 15_000, 15_000)
     np.save(tmp_path / "normals.npy", np.ones((*SMALL, 3)))
@@ -180,10 +180,10 @@ def test_no_command_takes_memory_for_a_header(tmp_path, size):
     refused(lambda: open_capture(tmp_path).read_mask(size), match)
     refused(lambda: measure_light_intensities(find_ball_files(tmp_path), lights, "card"), match)
     for number in range(3):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full(SMALL, 99 + number, np.uint8))
+        write_image(tmp_path / f"{number}.png", np.full(SMALL, 99 + number, np.uint8))
     other = (
-        rf"3\.png: found an image of {size[1]} x {size[0]} pixels, expected"
-        rf" {SMALL[1]} x {SMALL[0]} as in 0\.png"
+        rf"3\.png: found an image of {size[1]} x {size[0]} pixels, expected {SMALL[1]} x "
+        rf"{SMALL[0]} as in 0\.png"
     )
     refused(lambda: describe_capture(InfoOptions(capture=tmp_path)), other)
 
@@ -251,7 +251,7 @@ def test_arrays_too_large_to_read(tmp_path):
 
 def test_a_picture_with_gigabytes_behind_it(tmp_path):
     for name in ("a.png", "a.jpg", "a.tif"):
-        cv2.imwrite(str(tmp_path / name), np.ones(SMALL, np.uint8))
+        write_image(tmp_path / name, np.ones(SMALL, np.uint8))
         with (tmp_path / name).open("ab") as file:
             file.truncate(1 << 31)
         refused(

@@ -7,12 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 from torch import Tensor
 from torch.nn.functional import normalize, pad
+from torch.testing import assert_close
 
-from scenes import cap_directions, directions_at, ring_lights, spiral_lights
+from distributions import seeded
+from scenes import Floats, cap_directions, directions_at, ring_lights, spiral_lights
 from splinecli.estimate.fits.least_squares import (
     RIDGE,
     SMALLEST_VARIANCE,
@@ -25,15 +28,13 @@ from splinecli.estimate.fits.least_squares import (
     weighted_least_squares,
 )
 from splinecli.estimate.methods import MethodOptions, make_estimator
-from splinecli.maths.normals import angle_between_deg
+from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.robust import inverse_3x3, multiply_symmetric
 
 ROBUST = ("iw12", "l1", "ls-trimmed")
 
 
-def estimate(
-    name: str, observations: NDArray[np.floating], lights: NDArray[np.float64]
-) -> NDArray[np.floating]:
+def estimate(name: str, observations: NDArray[np.floating], lights: Floats) -> NDArray[np.floating]:
     return make_estimator(name, MethodOptions(device="cpu")).estimate(
         observations.astype(np.float32), lights
     )
@@ -77,13 +78,13 @@ def test_iw12_fixed_point(matte_pixels):
                 "fi,ij,fj->f", lights, posterior, lights
             )
             gamma = gamma.clip(SMALLEST_VARIANCE)
-        np.testing.assert_allclose(b, solution, rtol=1e-5)
+        assert_allclose(b, solution, rtol=1e-5)
 
 
 def test_l1_is_the_linear_programme_s_optimum():
     rng = np.random.default_rng(0)
     lights = rng.normal(size=(10, 3)) * (0.4, 0.4, 0.1) + (0, 0, 1)
-    lights /= np.linalg.norm(lights, axis=1, keepdims=True)
+    lights = unit(lights)
     observations = rng.uniform(size=(30, 10))
     found = solve_l1(torch.tensor(observations), torch.tensor(lights)).numpy()
     excess = []
@@ -121,11 +122,11 @@ def test_lights_that_span_a_plane_or_a_line_give_finite_normals():
     rng = np.random.default_rng(0)
     for spanned in (1, 2, 3):
         rows = rng.normal(size=(spanned, 3)) * (0.4, 0.4, 0.1) + (0, 0, 1)
-        lights = (rows / np.linalg.norm(rows, axis=1, keepdims=True))[np.arange(12) % spanned]
+        lights = unit(rows)[np.arange(12) % spanned]
         observations = rng.uniform(size=(2000, 12)).astype(np.float32)
         for name in ROBUST:
             found = estimate(name, observations, lights)
-            np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
+            assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
 
 
 def test_weighted_step_against_lapack():
@@ -138,12 +139,10 @@ def test_weighted_step_against_lapack():
     for i in range(5):
         root = np.sqrt(weight[i])[:, None]
         expected = np.linalg.lstsq(root * lights, root[:, 0] * observations[i], rcond=None)[0]
-        np.testing.assert_allclose(solution[i], expected, rtol=1e-6)
+        assert_allclose(solution[i], expected, rtol=1e-6)
         inverse = np.linalg.inv((root * lights).T @ (root * lights))
         entries = inverse[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-        np.testing.assert_allclose(
-            covariance[:, i], entries, rtol=1e-5, atol=1e-9 * np.trace(inverse)
-        )
+        assert_allclose(covariance[:, i], entries, rtol=1e-5, atol=1e-9 * np.trace(inverse))
 
 
 def normals_under(limit_deg: float, count: int) -> Tensor:
@@ -171,7 +170,7 @@ def test_pixels_without_shadow_are_recovered_with_their_albedo():
     scaled = fit_lambertian(observations, lights)
     assert error_deg(scaled, truth).max() < 0.1
     albedo = 1 / (truth @ lights.T).amax(dim=1)
-    torch.testing.assert_close(scaled.norm(dim=1), albedo, rtol=1e-3, atol=0)
+    assert_close(scaled.norm(dim=1), albedo, rtol=1e-3, atol=0)
 
 
 def test_shadows_over_a_third_of_the_lights_are_seen_through():
@@ -200,7 +199,7 @@ ROWS, COLUMNS = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
 """Places of xx, yy, zz, xy, xz, yz in a matrix."""
 
 
-def positive_matrices(count: int, rank: int = 3) -> NDArray[np.float64]:
+def positive_matrices(count: int, rank: int = 3) -> Floats:
     factors = np.random.default_rng(0).normal(size=(count, 3, rank))
     return np.asarray(factors @ factors.transpose(0, 2, 1))
 
@@ -221,7 +220,7 @@ def test_inverse(library):
     expected = np.linalg.inv(matrices)
     size = np.abs(expected).max(axis=(1, 2), keepdims=True)
     # The worst of a thousand such matrices has a condition number of about 1e7.
-    np.testing.assert_allclose(inverse(matrices, 1e-14, library) / size, expected / size, atol=1e-8)
+    assert_allclose(inverse(matrices, 1e-14, library) / size, expected / size, atol=1e-8)
 
 
 def test_numpy_and_torch_agree_to_the_last_bit():
@@ -246,7 +245,7 @@ def test_product_with_a_vector():
         multiply_symmetric(entries, vectors.T),
         np.einsum("pij,pj->ip", matrices, vectors),
     )
-    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 
 LIGHTS = torch.tensor(spiral_lights(10, 55))
@@ -257,7 +256,7 @@ def noisy_pixels(lights: Tensor, noise: float) -> tuple[Tensor, Tensor]:
     """Normals (2000, 3) of matte pixels that no light leaves dark, and their observations (2000,
     F).
     """
-    generator = torch.Generator().manual_seed(2)
+    generator = seeded(2)
     across = 0.6 * (torch.rand(2000, 2, generator=generator, dtype=torch.float64) - 0.5)
     normals = normalize(pad(across, (0, 1), value=1.0), dim=1)
     errors = torch.randn(2000, len(lights), generator=generator, dtype=torch.float64)
@@ -276,7 +275,7 @@ def test_the_change_is_half_the_difference_of_two_halves():
     )
     expected = (first - second) / 2
     found = compare_halves(observations, lights, alternating_signs(lights))
-    torch.testing.assert_close(found.normals, normalize(first + second, dim=1), atol=1e-5, rtol=0)
+    assert_close(found.normals, normalize(first + second, dim=1), atol=1e-5, rtol=0)
     # Along the normal, it is the albedo's.
     change = found.change - (found.change * found.normals).sum(dim=1, keepdim=True) * found.normals
     differences = ((change - expected).abs().amax(), (change + expected).abs().amax())
@@ -311,12 +310,12 @@ def test_errors_that_all_pixels_share_are_no_noise():
 def test_the_order_of_the_lights_changes_nothing():
     _, observations = noisy_pixels(LIGHTS, 0.01)
     found = compare_halves(observations, LIGHTS, SIGNS)
-    order = torch.randperm(10, generator=torch.Generator().manual_seed(3))
+    order = torch.randperm(10, generator=seeded(3))
     for other in (
         compare_halves(observations[:, order], LIGHTS[order], alternating_signs(LIGHTS[order])),
         compare_halves(observations, LIGHTS.expand(len(observations), -1, -1), SIGNS),
     ):
-        torch.testing.assert_close(tuple(other), tuple(found))
+        assert_close(tuple(other), tuple(found))
 
 
 def test_three_lights_and_black_pixels_disagree_about_nothing():

@@ -10,14 +10,14 @@ import quadprog
 import torch
 from numpy.typing import NDArray
 
-from scenes import cap_directions, halfway
+from scenes import Floats, cap_directions, halfway
 from splinecli.estimate.fits.ia14 import fit
 from splinecli.estimate.fits.st14 import solve_st14
 from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.maths.normals import angle_between_deg
 
-Array = NDArray[np.float64]
+Array = Floats
 
 
 def half_cosines(normals: Array, lights: Array) -> tuple[Array, Array]:
@@ -105,7 +105,7 @@ def test_noise_and_highlights_cost_less_than_in_least_squares(count, untouched):
     )
 
 
-Array = NDArray[np.float64]
+Array = Floats
 ON_CPU = MethodOptions(device="cpu")
 
 

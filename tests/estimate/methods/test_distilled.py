@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from torch import Tensor
 
+from distributions import seeded
 from scenes import Teacher, cap_directions, shade, spiral_lights
 from splinecli.errors import UsageError
 from splinecli.estimate.methods.distilled import DistilledEstimator, Perceptron, distil, draw_sample
@@ -100,9 +102,7 @@ def test_it_follows_the_truth_through_the_noise_of_its_teacher():
     assert told.expected_deg == pytest.approx(4, abs=0.2)
     assert told.held_out == pytest.approx(told.sample / 8, abs=1)
     assert teacher.asked == told.sample + found.n_unlike < 1800
-    np.testing.assert_allclose(
-        np.linalg.norm(found.estimate(observations, LIGHTS), axis=1), 1, atol=1e-5
-    )
+    assert_allclose(np.linalg.norm(found.estimate(observations, LIGHTS), axis=1), 1, atol=1e-5)
 
 
 @pytest.mark.parametrize("followed", [True, False])
@@ -131,7 +131,7 @@ def test_lamps_near_a_plane_of_bumps():
     points = np.concatenate((rng.uniform(-1, 1, (8000, 2)), np.zeros((8000, 1))), axis=1)
     normals = cap_directions(8000, 40)[rng.permutation(8000)]
     towards = 4 * LIGHTS - points[:, None]
-    directions = towards / np.linalg.norm(towards, axis=2, keepdims=True)
+    directions = unit(towards)
     shading = np.einsum("pfc,pc->pf", directions, normals).clip(0)
     observations = (shading + 0.3 * shading**8).astype(np.float32)
     teacher = sure(observations, noisy(normals, 4), 4)
@@ -147,7 +147,7 @@ def test_lamps_near_a_plane_of_bumps():
 
 @pytest.mark.parametrize("near", [False, True])
 def test_gradient_against_autograd(near):
-    generator = torch.Generator().manual_seed(3)
+    generator = seeded(3)
     normals, observations = glossy(300)
     lights = torch.tensor(LIGHTS, dtype=torch.float32).expand(*(len(normals),) * near, -1, -1)
     perceptron = Perceptron(lights, 16, generator)
@@ -198,8 +198,8 @@ def test_dark_pixels_have_no_normal():
     observations[::100] = 0
     teacher = sure(observations, normals)
     estimate, errors = learn(teacher).estimate_with_error(observations, LIGHTS)
-    np.testing.assert_array_equal(estimate[::100], np.tile((0, 0, 1), (30, 1)))
-    np.testing.assert_allclose(errors[::100], np.tile(UNKNOWN_ERROR, (30, 1)), rtol=1e-6)
+    assert_array_equal(estimate[::100], np.tile((0, 0, 1), (30, 1)))
+    assert_allclose(errors[::100], np.tile(UNKNOWN_ERROR, (30, 1)), rtol=1e-6)
 
 
 def test_the_same_seed_gives_the_same_and_no_other_draws_change():
@@ -211,7 +211,7 @@ def test_the_same_seed_gives_the_same_and_no_other_draws_change():
     first, again, other = (
         learn(teacher, SMALL, seed=seed).estimate(observations, LIGHTS) for seed in (1, 1, 2)
     )
-    np.testing.assert_array_equal(first, again)
+    assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-4
     assert torch.equal(torch.rand(3), expected)
 
@@ -236,7 +236,7 @@ def test_sizes_grow_with_the_capture():
 
 def clusters() -> Tensor:
     """Return 5,000 features near the origin, 20 far away near (9, 0, 0), and one at (0, 30, 0)."""
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     points = torch.randn(5021, 3, generator=generator) * 0.3
     points[5000:, 0] += 9
     points[5020] = torch.tensor((0.0, 30.0, 0.0))
@@ -244,7 +244,7 @@ def clusters() -> Tensor:
 
 
 def test_rare_kinds_are_in_the_sample():
-    sample = draw_sample(clusters(), 1200, torch.Generator().manual_seed(0))
+    sample = draw_sample(clusters(), 1200, seeded(0))
     rows = sample.rows.tolist()
     assert len(set(rows)) == len(rows)
     assert len(rows) == 1200
@@ -254,12 +254,7 @@ def test_rare_kinds_are_in_the_sample():
 def test_the_first_rows_are_an_even_sample():
     """The far cluster has its share of them, 0.4 %, and not more."""
     counts = [
-        int(
-            (
-                draw_sample(clusters(), 1200, torch.Generator().manual_seed(seed)).rows[:600]
-                >= 5000
-            ).sum()
-        )
+        int((draw_sample(clusters(), 1200, seeded(seed)).rows[:600] >= 5000).sum())
         for seed in range(8)
     ]
     # Poisson of mean 20.1 in all: three standard deviations either way.
@@ -268,17 +263,17 @@ def test_the_first_rows_are_an_even_sample():
 
 def test_rare_groups_and_strangers_are_unlike():
     points = clusters()
-    sample = draw_sample(points, 1200, torch.Generator().manual_seed(0), rare_share=0.005)
+    sample = draw_sample(points, 1200, seeded(0), rare_share=0.005)
     unlike = sample.unlike(points)
     assert unlike[5020]
     assert unlike.float().mean() <= 0.005
-    none_rare = draw_sample(points, 1200, torch.Generator().manual_seed(0))
+    none_rare = draw_sample(points, 1200, seeded(0))
     assert not none_rare.unlike(points).any()
     assert none_rare.unlike(torch.tensor([[0.0, 0.0, -30.0]])).all()
 
 
 def test_equal_pixels_are_one_group():
-    sample = draw_sample(torch.ones(500, 4), 100, torch.Generator().manual_seed(0))
+    sample = draw_sample(torch.ones(500, 4), 100, seeded(0))
     assert len(sample.rows) == 100
     assert sample.reach == 0
     assert not sample.unlike(torch.ones(3, 4)).any()

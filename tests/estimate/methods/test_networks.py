@@ -14,7 +14,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from scenes import directions_at, evaluate, shade, sphere, spiral_lights
+from scenes import Floats, Mask, directions_at, evaluate, read_json, shade, sphere, spiral_lights
 from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.estimate.methods.batched import NetworkEstimator, context_sample, rotations_of
 from splinecli.estimate.methods.estimator import CONFIDENT_DEG
@@ -29,11 +29,11 @@ from splinecli.workshop.synthesis.pixels import PixelGenerator, PixelGeneratorCo
 from tiny_networks import random_network
 
 
-def pixels(count: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+def pixels(count: int) -> tuple[NDArray[np.float32], Floats]:
     rng = np.random.default_rng(0)
     lights = rng.normal(size=(10, 3)) + np.array((0, 0, 3))
     observations = rng.uniform(size=(count, 10)).astype(np.float32)
-    return observations, lights / np.linalg.norm(lights, axis=1, keepdims=True)
+    return observations, unit(lights)
 
 
 def estimator(network: SplineNet | None = None, **options: Any) -> NetworkEstimator:
@@ -96,11 +96,11 @@ def test_progress_changes_no_bit():
     assert done == [100, 50]
 
 
-def lighting_at(observations: NDArray[np.float32], lights: NDArray[np.float64]) -> LightingAt:
+def lighting_at(observations: NDArray[np.float32], lights: Floats) -> LightingAt:
     return lambda rows: PixelLighting(observations[rows], lights)
 
 
-def row(n_pixels: int) -> NDArray[np.bool_]:
+def row(n_pixels: int) -> Mask:
     """Return a mask (1, P) that fills its image, so that no pixel is at an outline."""
     return np.ones((1, n_pixels), np.bool_)
 
@@ -134,7 +134,7 @@ def test_a_black_background_says_nothing_of_the_object():
     assert np.array_equal(network.estimate(0 * dark, lights), np.tile((0, 0, 1), (800, 1)))
 
 
-def sampled(brightness: NDArray[np.float64], mask: NDArray[np.bool_]) -> list[float]:
+def sampled(brightness: Floats, mask: Mask) -> list[float]:
     """Return the brightness (H, W) of the pixels that are sampled from a capture."""
     observations = np.repeat(brightness[mask].astype(np.float32)[:, None], 4, axis=1)
     found, _ = context_sample(lighting_at(observations, spiral_lights(4)), mask)
@@ -326,7 +326,7 @@ def test_stored_prediction(name, request):
     estimated = make_estimator(name, MethodOptions(precision="float32")).estimate(
         observations, lights
     )
-    stored = json.loads(GOLDEN.read_text("utf-8"))
+    stored = read_json(GOLDEN)
     if request.config.getoption("--update-golden"):
         stored[name] = np.round(estimated, 4).tolist()
         GOLDEN.write_text(json.dumps(dict(sorted(stored.items()))) + "\n", "utf-8")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from scenes import spiral_lights
@@ -19,7 +20,7 @@ from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import save_weights
 from splinecli.lights.lighting import PixelLighting
-from splinecli.maths.normals import angle_between_deg
+from splinecli.maths.normals import angle_between_deg, unit
 from tiny_networks import TINY
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
@@ -54,8 +55,8 @@ def test_every_method_says_what_it_is_and_estimates(weights, tmp_path):
         # Lambertian fit.
         normals = estimator.estimate(observations, LIGHTS)
         assert normals.shape == (3, 3)
-        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-5)
-        np.testing.assert_allclose(normals, truth, atol=0.01)
+        assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-5)
+        assert_allclose(normals, truth, atol=0.01)
     assert len(fingerprints) == len(method_names())
 
 
@@ -139,7 +140,7 @@ def test_odd_pixels_still_get_a_normal(name, n_lights, glossy_pixels):
     odd[3] = np.where(np.arange(n_lights) < 2, odd[3] + 1, 0)
     odd[4] *= -1  # a dark frame may have been subtracted
     found = make(name).estimate(odd, lights[:n_lights])
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
+    assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
     np.testing.assert_array_equal(found[0], (0, 0, 1))
 
 
@@ -176,6 +177,4 @@ def test_solves_the_normal_equations(count):
     directions = spiral_lights(count)
     estimate = LeastSquares().estimate(observations, directions)
     expected = np.linalg.lstsq(directions, observations.T, rcond=None)[0].T
-    np.testing.assert_allclose(
-        estimate, expected / np.linalg.norm(expected, axis=1, keepdims=True), atol=1e-12
-    )
+    assert_allclose(estimate, unit(expected), atol=1e-12)

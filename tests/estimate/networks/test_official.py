@@ -15,7 +15,9 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.testing import assert_close
 
+from distributions import seeded
 from splinecli.errors import ModelError
 from splinecli.estimate.networks.li_ne_net import PaperLINet, PaperNENet
 from splinecli.estimate.networks.spline_net import SplineNet
@@ -146,7 +148,7 @@ def changed(authors: Authors, files: Files, tmp_path: Path) -> Callable[..., Fil
 
 
 def maps(seed: int, channels: int = 1) -> Tensor:
-    return torch.rand(3, channels, SIDE, SIDE, generator=torch.Generator().manual_seed(seed))
+    return torch.rand(3, channels, SIDE, SIDE, generator=seeded(seed))
 
 
 def embed(observations: Tensor, lights: Tensor) -> Tensor:
@@ -160,7 +162,7 @@ def embed(observations: Tensor, lights: Tensor) -> Tensor:
 
 
 def test_observations_give_the_normals_that_theirs_give(authors, imported):
-    generator = torch.Generator().manual_seed(4)
+    generator = seeded(4)
     observations = torch.rand(6, 10, generator=generator) * 3
     lights = torch.randn(10, 3, generator=generator).abs() * torch.tensor((1.0, 1.0, 1.5))
     lights[::2, 0] *= -1
@@ -172,8 +174,8 @@ def test_observations_give_the_normals_that_theirs_give(authors, imported):
     with torch.no_grad():
         normals = imported(observations, lights).normals
         views = imported.build_maps(observations, lights)
-    torch.testing.assert_close(views.sparse.flip(2), sparse, atol=1e-7, rtol=0)
-    torch.testing.assert_close(normals, expected, atol=1e-5, rtol=0)
+    assert_close(views.sparse.flip(2), sparse, atol=1e-7, rtol=0)
+    assert_close(normals, expected, atol=1e-5, rtol=0)
     assert expected.std(0).max() > 1e-3
 
 

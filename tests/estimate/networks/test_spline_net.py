@@ -9,7 +9,10 @@ import pytest
 import torch
 from scipy import stats
 from torch import Tensor, nn
+from torch.nn.functional import normalize
+from torch.testing import assert_close
 
+from distributions import seeded
 from splinecli.estimate.fits.least_squares import fit_lambertian
 from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.estimate.networks.config import STARTING_FITS, NetworkConfig, fit_normals
@@ -38,10 +41,10 @@ def pixels() -> tuple[Tensor, Tensor]:
     another cell.
     """
     config = PixelGeneratorConfig(min_lights=10, max_lights=10, light_direction_error_share=0.0)
-    generator = torch.Generator().manual_seed(5)
+    generator = seeded(5)
     lights = PixelGenerator(config, generator).draw(1).light_directions[0].double()
     scene = PixelGenerator(config, generator).draw(64).truth
-    return scene.radiance(lights.float()).double(), torch.nn.functional.normalize(lights, dim=1)  # type: ignore[attr-defined]
+    return scene.radiance(lights.float()).double(), normalize(lights, dim=1)  # type: ignore[attr-defined]
 
 
 def turn(vectors: Tensor, degrees: float) -> Tensor:
@@ -49,28 +52,22 @@ def turn(vectors: Tensor, degrees: float) -> Tensor:
     return rotate_about_view_axis(vectors.double(), angle.cos(), angle.sin())
 
 
-def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(
-    pixels,
-):
+def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(pixels):
     observations, lights = pixels
     network = SplineNet(NetworkConfig(**TINY)).double()
-    expected = torch.nn.functional.normalize(
-        fit_lambertian(observations / map_scale(observations), lights), dim=1
-    )
+    expected = normalize(fit_lambertian(observations / map_scale(observations), lights), dim=1)
     visible = expected[:, 2] > 0.05
     assert visible.sum() > 50
     with torch.no_grad():
         normals = network(observations, lights).normals
         dense = network.interpolate(network.build_maps(observations, lights))
-    torch.testing.assert_close(
-        normals[visible], expected[visible], atol=1e-6, rtol=0, check_dtype=False
-    )
+    assert_close(normals[visible], expected[visible], atol=1e-6, rtol=0, check_dtype=False)
     # Its dense map is that normal's Lambertian one, turned to azimuth 0.
     b = fit_lambertian(observations / map_scale(observations), lights)[visible]
     x, z = b[:, :2].norm(dim=1)[:, None, None], b[:, 2, None, None]
     cells, _ = cell_directions()
     matte = (x * cells[..., 0] + z * cells[..., 2]).clamp(0, 1)
-    torch.testing.assert_close(dense[visible, 0], matte, atol=1e-6, rtol=0)
+    assert_close(dense[visible, 0], matte, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("settings", [{}, SET])
@@ -82,10 +79,10 @@ def test_compact_estimates_turn_with_the_lights(pixels, degrees, settings):
         here, there = (
             network(observations, seen).normals for seen in (lights, turn(lights, degrees))
         )
-    torch.testing.assert_close(there.double(), turn(here, degrees), atol=1e-5, rtol=0)
+    assert_close(there.double(), turn(here, degrees), atol=1e-5, rtol=0)
     # The correction is not nothing: without it the fit alone would pass.
     fit = fit_lambertian(observations / map_scale(observations), lights)
-    assert (here - torch.nn.functional.normalize(fit, dim=1)).abs().max() > 0.01
+    assert (here - normalize(fit, dim=1)).abs().max() > 0.01
 
 
 @pytest.mark.parametrize("settings", [{}, SET])
@@ -96,9 +93,7 @@ def test_observations_that_are_not_valid_do_not_matter(pixels, settings):
     garbage = observations.where(valid, torch.tensor(9.0, dtype=torch.float64))
     with torch.no_grad():
         expected = network(observations[:, :7], lights[:7]).normals
-        torch.testing.assert_close(
-            network(garbage, lights, valid).normals, expected, atol=1e-5, rtol=0
-        )
+        assert_close(network(garbage, lights, valid).normals, expected, atol=1e-5, rtol=0)
 
 
 def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(pixels):
@@ -109,7 +104,7 @@ def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(pixels):
         mirrored = network(observations, lights, rotation=Rotation(7.0, mirror=True)).normals
         expected = network(observations, lights * FLIP, rotation=Rotation(-7.0)).normals * FLIP
         plain = network(observations, lights, rotation=Rotation(7.0)).normals
-    torch.testing.assert_close(mirrored, expected, atol=1e-5, rtol=0, check_dtype=False)
+    assert_close(mirrored, expected, atol=1e-5, rtol=0, check_dtype=False)
     assert (mirrored - plain).abs().max() > 1e-4
 
 
@@ -120,15 +115,15 @@ def test_frames_there_and_back(pixels, mirror):
     views = network.build_maps(
         observations, lights, rotation=Rotation(torch.linspace(-15, 15, 64), mirror=mirror)
     )
-    vectors = torch.nn.functional.normalize(torch.randn(64, 3, dtype=torch.float64), dim=1)
-    torch.testing.assert_close(to_capture_frame(to_pixel_frame(vectors, views), views), vectors)
+    vectors = normalize(torch.randn(64, 3, dtype=torch.float64), dim=1)
+    assert_close(to_capture_frame(to_pixel_frame(vectors, views), views), vectors)
     # In its own frame a pixel's Lambertian normal has the azimuth of the further turn, mirrored or
     # not.
     fit = fit_lambertian(observations / map_scale(observations), lights)
     tilted = fit[:, :2].norm(dim=1) > 0.01
     azimuth = torch.rad2deg(torch.atan2(*to_pixel_frame(fit, views)[:, [1, 0]].unbind(1)))
     expected = torch.linspace(-15, 15, 64) * (-1 if mirror else 1)
-    torch.testing.assert_close(azimuth[tilted], expected[tilted].double(), atol=1e-4, rtol=0)
+    assert_close(azimuth[tilted], expected[tilted].double(), atol=1e-4, rtol=0)
 
 
 def test_autocast_does_not_round_the_geometry(pixels):
@@ -139,7 +134,7 @@ def test_autocast_does_not_round_the_geometry(pixels):
     with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
         coarse = network(observations, lights).normals
     with torch.no_grad():
-        torch.testing.assert_close(coarse, network(observations, lights).normals, atol=1e-6, rtol=0)
+        assert_close(coarse, network(observations, lights).normals, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize(("median_deg", "shape"), [(0.5, 1.0), (4.0, 2.5), (30.0, 0.7)])
@@ -162,8 +157,8 @@ def test_a_log_logistic_distribution(median_deg, shape):
 def test_it_changes_no_normal():
     plain, telling = random_network(fits=["ls"]), random_network(fits=["ls"], error_head=True)
     telling.load_state_dict(plain.state_dict(), strict=False)
-    generator = torch.Generator().manual_seed(1)
-    lights = torch.nn.functional.normalize(torch.rand(9, 3, generator=generator) + 0.1, dim=1)
+    generator = seeded(1)
+    lights = normalize(torch.rand(9, 3, generator=generator) + 0.1, dim=1)
     observations = torch.rand(20, 9, generator=generator)
     with torch.inference_mode():
         normals, error = telling(observations, lights)
@@ -173,7 +168,7 @@ def test_it_changes_no_normal():
         # It is of the pixel, not of its place in the capture's frame.
         turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         turned = telling(observations, lights @ turn.T).error
-    torch.testing.assert_close(turned, error, atol=1e-4, rtol=0)
+    assert_close(turned, error, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("n_maps", [1, 300])
@@ -185,7 +180,7 @@ def test_few_products_give_the_features_of_the_convolutions(n_maps):
     with torch.no_grad():
         found = encoder(maps)
         expected = encoder.double()(maps.double())
-    torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-4)
+    assert_close(found.double(), expected, rtol=1e-4, atol=1e-4)
 
 
 NAMES = tuple(STARTING_FITS)
@@ -195,9 +190,9 @@ def draw_pixels(count: int, lights: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Observations (P, F), the largest of each pixel 1, and lights (P, F, 3) of its own for each
     pixel.
     """
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     directions = torch.randn(count, lights, 3, generator=generator) + torch.tensor((0.0, 0.0, 2.0))
-    directions = torch.nn.functional.normalize(directions, dim=-1)
+    directions = normalize(directions, dim=-1)
     observations = torch.rand(count, lights, generator=generator)
     return observations / observations.amax(dim=1, keepdim=True), directions
 
@@ -210,7 +205,7 @@ def test_they_are_the_methods_of_these_names(name):
         observations.numpy(), shared.double().numpy()
     )
     found = fit_normals([name], observations, shared)[:, 0]
-    torch.testing.assert_close(found, torch.from_numpy(expected).float(), atol=1e-5, rtol=0)
+    assert_close(found, torch.from_numpy(expected).float(), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -222,7 +217,7 @@ def test_each_pixel_has_its_own_lights_and_their_number(name):
     for pixel in range(9):
         own = slice(0, int(count[pixel]))
         alone = fit_normals([name], observations[pixel : pixel + 1, own], directions[pixel, own])
-        torch.testing.assert_close(found[pixel : pixel + 1], alone, atol=1e-4, rtol=0)
+        assert_close(found[pixel : pixel + 1], alone, atol=1e-4, rtol=0)
 
 
 def test_pixels_that_no_fit_can_tell_anything_of():

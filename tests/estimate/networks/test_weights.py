@@ -11,6 +11,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
+from torch.testing import assert_close
 
 from splinecli.errors import ModelError
 from splinecli.estimate.networks import weights
@@ -46,15 +47,13 @@ def test_round_trip(tmp_path, settings):
     assert loaded.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     for name, tensor in network.state_dict().items():
         # float16 keeps 11 bits.
-        torch.testing.assert_close(
-            loaded.network.state_dict()[name], tensor, rtol=2**-11, atol=2**-24
-        )
+        assert_close(loaded.network.state_dict()[name], tensor, rtol=2**-11, atol=2**-24)
     lights = torch.nn.functional.normalize(
         torch.tensor([[0.3, 0, 1], [-0.3, 0.2, 1], [0, -0.4, 1]]), dim=1
     )
     observations = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        torch.testing.assert_close(
+        assert_close(
             loaded.network(observations, lights).normals,
             network(observations, lights).normals,
             atol=5e-3,

@@ -8,11 +8,14 @@ from typing import TypeVar
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import normalize, pad
+from torch.testing import assert_close
 
 from conftest import directions_at
+from distributions import seeded
 from scenes import evaluate, spiral_lights
 from splinecli.capture import Capture
 from splinecli.estimate.fits.least_squares import alternating_signs
@@ -42,7 +45,7 @@ Network = TypeVar("Network", bound=torch.nn.Module)
 
 def lively(network: Network) -> Network:
     """Fill every parameter with small random numbers."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.copy_(0.08 * torch.randn(parameter.shape, generator=generator))
@@ -80,22 +83,22 @@ def test_tiles_change_nothing(shape):
     mask[30:60, 10:30] = False
     _, normals, errors = refine(mask, 512)
     _, tiled, tiled_errors = refine(mask, REACH)
-    np.testing.assert_allclose(tiled, normals, atol=1e-4)
-    np.testing.assert_allclose(tiled_errors, errors, rtol=1e-4, atol=1e-3)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    assert_allclose(tiled, normals, atol=1e-4)
+    assert_allclose(tiled_errors, errors, rtol=1e-4, atol=1e-3)
+    assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (37, 1), (5, 6)])
 def test_small_and_thin_masks(shape):
     before, normals, _ = refine(np.ones(shape, np.bool_), 512)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
     assert np.abs(normals - before).max() > 1e-3
 
 
 def test_dark_pixels_stay():
     before, normals, errors = refine(np.ones((8, 9), np.bool_), 512, dark=20)
-    np.testing.assert_array_equal(normals[20], before[20])
-    np.testing.assert_allclose(errors[20], UNKNOWN_ERROR, rtol=1e-6)
+    assert_array_equal(normals[20], before[20])
+    assert_allclose(errors[20], UNKNOWN_ERROR, rtol=1e-6)
     assert (normals[21] != before[21]).any()
 
 
@@ -122,7 +125,7 @@ def test_a_turned_capture_gets_turned_normals():
 
     # The cells of the coarse scales begin at the map's corner, so both sides are multiples of them
     # in this test.
-    np.testing.assert_allclose(refined(1), refined(0), atol=1e-3)
+    assert_allclose(refined(1), refined(0), atol=1e-3)
 
 
 def estimator(*, refines: bool) -> NetworkEstimator:
@@ -143,7 +146,7 @@ def test_the_pixelwise_method_leaves_the_refinement_out():
         estimate_normals(capture, estimator(refines=refines)) for refines in (False, True)
     )
     alone = estimator(refines=True).estimate(capture.observations, LIGHTS)
-    np.testing.assert_array_equal(pixelwise.normal_map[mask], alone)
+    assert_array_equal(pixelwise.normal_map[mask], alone)
     assert np.abs(refined.normal_map - pixelwise.normal_map).max() > 1e-3
     assert np.abs(refined.confidence_map - pixelwise.confidence_map).max() > 1e-3
 
@@ -182,7 +185,7 @@ def photographed(
     """Features (CHANNELS, SIDE, SIDE) of a matte surface, where SPLINE-Net has seen the normals
     `seen` (the truth).
     """
-    generator = torch.Generator().manual_seed(4)
+    generator = seeded(4)
     errors = noise * torch.randn(SIDE**2, len(lights), generator=generator)
     observations = (truth.flatten(1).T @ lights.T + errors).clamp(min=0)
     normals = (truth if seen is None else seen).flatten(1).T
@@ -223,7 +226,7 @@ def test_grooves_come_back_where_they_exceed_the_noise(noise, least, most):
 def test_nothing_comes_back_that_least_squares_does_not_show():
     """SPLINE-Net has seen the opposite of the grooves."""
     features = photographed(GROOVES, 0.005, seen=torch.roll(GROOVES, 1, dims=-1))
-    torch.testing.assert_close(restored(FLAT, features, EVERYWHERE), FLAT, atol=1e-4, rtol=0)
+    assert_close(restored(FLAT, features, EVERYWHERE), FLAT, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("creased", [False, True])
@@ -247,17 +250,17 @@ def test_black_pixels_change_nothing_beside_them():
     noisy = photographed_with_noise(truth, 0.03)
     noisy[:, :, black] = 0
     found = restored(FLAT, noisy, EVERYWHERE)
-    torch.testing.assert_close(found[..., black], FLAT[..., black])
+    assert_close(found[..., black], FLAT[..., black])
     assert (found - FLAT).square().mean() < 0.01 * (noisy[:3] - truth).square().mean()
 
 
 def test_outside_of_the_mask_is_outside_of_the_image():
     wide = (9, 3, 4, 8)
-    mask = torch.rand(1, SIDE, SIDE, generator=torch.Generator().manual_seed(6)) < 0.9
+    mask = torch.rand(1, SIDE, SIDE, generator=seeded(6)) < 0.9
     maps = FLAT * mask, photographed(GROOVES, 0.05) * mask, mask.float()
     alone, within = restored(*maps), restored(*(pad(values, wide) for values in maps))
     assert (alone - FLAT * mask).abs().mean() > 0.03
-    torch.testing.assert_close(within, pad(alone, wide), atol=1e-5, rtol=0)
+    assert_close(within, pad(alone, wide), atol=1e-5, rtol=0)
 
 
 def test_nothing_beyond_the_reach_counts():

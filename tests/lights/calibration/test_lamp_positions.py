@@ -10,10 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from lights.calibration.conftest import Render
-from scenes import directions_at, spiral_lights
+from scenes import Floats, directions_at, spiral_lights
 from splinecli.lights.calibration.balls import (
     DISTANT,
     SHORTEST_LENS,
@@ -38,13 +37,13 @@ SHAPE = 160, 400
 BALLS = Circle(70, 90, 60), Circle(320, 75, 60)
 
 
-def lamps(distance: float) -> NDArray[np.float64]:
+def lamps(distance: float) -> Floats:
     """Six lamps at 15 to 50 degrees from the view."""
     return distance * spiral_lights(6, 50, 15)
 
 
 def calibrate(
-    folder: Path, render_ball: Render, positions: NDArray[np.float64], *, known: bool = True
+    folder: Path, render_ball: Render, positions: Floats, *, known: bool = True
 ) -> list[BallCalibration]:
     """The balls, with the matrix of a camera that is far away or without one."""
     matrix = folder / "matrix.txt"
@@ -77,7 +76,7 @@ PIXELS = (2000, 3000)
 
 def photographed(
     rng: np.random.Generator, camera: float, source: str, *, height: float = 0.0
-) -> tuple[NDArray[np.float64], list[BallCalibration]]:
+) -> tuple[Floats, list[BallCalibration]]:
     """Lamps (6, 3), and two balls of 40 mm as a pinhole camera sees them, 80 mm being the width of
     the object.
 
@@ -93,7 +92,7 @@ def photographed(
     focal = PIXELS[1] * eye[2] / FIELD
     middle = np.array(((PIXELS[1] - 1) / 2, (PIXELS[0] - 1) / 2))
 
-    def image_of(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def image_of(points: Floats) -> Floats:
         seen = points - eye
         return middle + focal * seen[:, :2] / -seen[:, 2:] * (1, -1)
 
@@ -195,13 +194,13 @@ def test_lamps_without_positions(tmp_path, render_ball, known):
     assert triangulate_lamps(balls[:1]) is None
 
 
-def turned(directions: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
+def turned(directions: Floats, degrees: float) -> Floats:
     """Turn directions (F, 3) about the x axis."""
     cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return directions @ np.array([(1, 0, 0), (0, cosine, sine), (0, -sine, cosine)])
 
 
-def ball(directions: NDArray[np.float64]) -> BallCalibration:
+def ball(directions: Floats) -> BallCalibration:
     files = BallFiles(Path("ball"), (Path("ball/1.png"),) * len(directions), None, None)
     highlights = tuple(Highlight(1.23456, 2.0, 0.25) for _ in directions)
     normals = unit(directions + np.array((0, 0, 1)))
@@ -211,12 +210,12 @@ def ball(directions: NDArray[np.float64]) -> BallCalibration:
     )
 
 
-def report(balls: list[BallCalibration], known: NDArray[np.float64] | None = None) -> dict:
+def report(balls: list[BallCalibration], known: Floats | None = None) -> dict:
     return calibration_report(combine_balls(balls), None, known, picture="calibration.png")
 
 
 @pytest.fixture
-def directions() -> NDArray[np.float64]:
+def directions() -> Floats:
     """Four lights (4, 3) in the plane x, z, so that all turn alike about the x axis where x is
     zero.
     """
@@ -231,8 +230,8 @@ def test_one_ball(directions):
     assert found["warnings"] == []
     assert found["balls"][0]["highlights"][0] == [1.235, 2.0]
     assert summary_lines(found) == [
-        "ball: circle 50.0, 40.0, radius 30.0 pixels (from --circle, 100 % of the outline visible,"
-        " spread 0.0 pixels)"
+        "ball: circle 50.0, 40.0, radius 30.0 pixels (from --circle, 100 % of the outline visible, "
+        "spread 0.0 pixels)"
     ]
 
 

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
-from distributions import generator as seeded
+from distributions import seeded
 from splinecli.maths.observation_map import cell_directions
 from splinecli.workshop.pixel_sets.source import (
     FILL_ROUNDS,
@@ -141,9 +142,9 @@ def test_dense_truth_is_the_analytic_map_after_a_rotation(quarter_turns):
     for _ in range(quarter_turns):
         x, y = -y, x
     rotated = torch.stack((x, y, z), dim=1)
-    torch.testing.assert_close(turned.normals, rotated)
+    assert_close(turned.normals, rotated)
     analytic = (cell_directions()[0] @ rotated.T).permute(2, 0, 1)[:, None].clamp(min=0)
-    torch.testing.assert_close(dense.values * dense.known, analytic * dense.known)
+    assert_close(dense.values * dense.known, analytic * dense.known)
     # Interpolated between cells of 1 / 16, where n . l has a slope of about 1; along the rim, where
     # l_z falls steeply and all neighbours lie further in, errors are larger.
     filled = dense.filled - dense.known

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from kills import content, killed_at
+from scenes import read_json
 from small_pixel_sets import matte_pixels
 from splinecli.errors import InputError, OutputError
 from splinecli.system.publishing import held_folder
@@ -25,7 +26,7 @@ RECIPE = {"scenes": {"lights": 30}, "seed": 1}
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / MANIFEST).read_text())
+    return read_json(folder / MANIFEST)
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])

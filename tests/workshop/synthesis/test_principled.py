@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from scipy import integrate
 
+from distributions import seeded
 from splinecli.materials.principled import PrincipledMaterial
 from splinecli.workshop.synthesis.draw_materials import draw_material
 
@@ -142,7 +143,7 @@ def test_agrees_with_the_published_equations(surface):
 
 
 def test_float32_is_close_to_float64():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     surface = draw_material(200, generator)
     double = PrincipledMaterial(*(getattr(surface, name).double() for name in NAMES))
     lights = torch.from_numpy(hemisphere(100))
@@ -158,7 +159,7 @@ def test_float32_is_close_to_float64():
 
 
 def test_drawn_materials_have_the_stated_classes():
-    drawn = draw_material(40_000, torch.Generator().manual_seed(0))
+    drawn = draw_material(40_000, seeded(0))
     values = {name: getattr(drawn, name).numpy().ravel() for name in NAMES}
     metal, blend = values["metallic"] == 1, (values["metallic"] > 0) & (values["metallic"] < 1)
     for flags, share in (
@@ -189,7 +190,7 @@ def test_drawn_materials_have_the_stated_classes():
 
 
 def test_light_from_behind_what_is_seen_is_finite():
-    surface = draw_material(50, torch.Generator().manual_seed(0))
+    surface = draw_material(50, seeded(0))
     view = torch.full((50, 1), 0.5)
     for l_dot_v in (-1.0, -1.0000001):
         assert torch.isfinite(surface.shade(-view, view, torch.full((50, 1), l_dot_v))).all()

@@ -5,6 +5,7 @@ import pytest
 
 pytest.importorskip("embreex", reason="needs the extra 'render'")
 
+from splinecli.maths.normals import unit
 from splinecli.workshop.synthesis.meshes import Mesh
 from splinecli.workshop.synthesis.scenes import (
     MATERIALS,
@@ -68,5 +69,5 @@ def test_lights_cover_the_upper_hemisphere():
     assert np.histogram(lights[:, 2], bins=5, range=(0, 1))[0] == pytest.approx(100, abs=15)
     probes = np.random.default_rng(1).normal(size=(500, 3))
     probes[:, 2] = np.abs(probes[:, 2])
-    probes /= np.linalg.norm(probes, axis=1, keepdims=True)
+    probes = unit(probes)
     assert np.degrees(np.arccos((probes @ lights.T).max(axis=1))).max() < 12

@@ -6,11 +6,13 @@ import time
 import zipfile
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
+from scenes import write_image
 from splinecli.errors import InputError
+from splinecli.maths.normals import unit
 from splinecli.workshop.synthesis import meshes
 from splinecli.workshop.synthesis.meshes import (
     REACH,
@@ -66,7 +68,7 @@ def test_a_smooth_union_fills_the_seam_and_a_cut_takes_out():
     # a quarter of the blend, where both are alike
     assert below.max() == pytest.approx(0.025, abs=1e-3)
     cut, apart = meshes.smooth_cut(first, second, 0.1), np.abs(first + second) > 0.1
-    np.testing.assert_allclose(cut[apart], np.maximum(first, -second)[apart])
+    assert_allclose(cut[apart], np.maximum(first, -second)[apart])
 
 
 def test_triangles_lie_on_the_zero_with_the_field_s_normals():
@@ -91,9 +93,7 @@ def test_crumbs_and_the_empty_field_are_dropped():
     assert meshes.triangulate(lambda at: np.ones(len(at), np.float32), (1.0, 1.0, 1.0), 0.1) is None
 
 
-def test_skipping_what_is_far_from_the_surface_changes_nothing(
-    monkeypatch,
-):
+def test_skipping_what_is_far_from_the_surface_changes_nothing(monkeypatch):
     noise = meshes.waves(np.random.default_rng(0), 1.0)
 
     def lumps(at):
@@ -103,7 +103,7 @@ def test_skipping_what_is_far_from_the_surface_changes_nothing(
     monkeypatch.setattr(meshes, "COARSE", 1)
     dense = meshes.triangulate(lumps, (1.0, 1.0, 1.0), 0.05)
     assert len(sparse.faces) == len(dense.faces)
-    np.testing.assert_allclose(outward_volume(sparse), outward_volume(dense), rtol=1e-5)
+    assert_allclose(outward_volume(sparse), outward_volume(dense), rtol=1e-5)
 
 
 @pytest.mark.parametrize("kind", list(KINDS))
@@ -113,7 +113,7 @@ def test_each_kind_is_sound_and_hollow(kind, monkeypatch):
     mesh = draw_shape_of_kind(kind, np.random.default_rng(5))
     assert mesh.vertices.dtype == mesh.vertex_normals.dtype == np.float32
     assert mesh.faces.min() == 0 and mesh.faces.max() == len(mesh.vertices) - 1
-    np.testing.assert_allclose(np.linalg.norm(mesh.vertex_normals, axis=1), 1, atol=1e-5)
+    assert_allclose(np.linalg.norm(mesh.vertex_normals, axis=1), 1, atol=1e-5)
     assert outward_volume(mesh) > 0
     reach = np.abs(mesh.vertices[:, :2]).max()
     # A relief goes beyond the frame, so that no pixel sees its edge.
@@ -146,14 +146,14 @@ HEIGHT_SLOPES = np.stack(
 def test_slopes_are_found_whichever_way_green_points(tmp_path, green_up):
     normals = np.dstack((-HEIGHT_SLOPES, np.ones((SIDE, SIDE))))
     normals[..., 1] *= -1 if green_up else 1
-    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    normals = unit(normals)
     path = tmp_path / "waves.png"
-    cv2.imwrite(str(path), np.rint((normals + 1) / 2 * 65535).astype(np.uint16)[..., ::-1])  # type: ignore[operator]
-    np.testing.assert_allclose(read_relief(path), HEIGHT_SLOPES, atol=1e-3)
+    write_image(path, np.rint((normals + 1) / 2 * 65535).astype(np.uint16)[..., ::-1])  # type: ignore[operator]
+    assert_allclose(read_relief(path), HEIGHT_SLOPES, atol=1e-3)
 
 
 def test_a_gray_image_is_no_relief(tmp_path):
-    cv2.imwrite(str(tmp_path / "gray.png"), np.zeros((8, 8), np.uint8))
+    write_image(tmp_path / "gray.png", np.zeros((8, 8), np.uint8))
     with pytest.raises(InputError, match="found a gray image, expected a normal map"):
         read_relief(tmp_path / "gray.png")
 
@@ -165,7 +165,7 @@ def test_a_plate_gets_the_normals_of_the_height():
     up = np.tile(np.float32((0, 0, 1)), (500, 1))
     slope = 0.6 * np.cos(2 * np.pi * (places[:, 0] + places[:, 1]) / 0.5)
     expected = np.stack((-slope, -slope, np.ones(500)), axis=1)
-    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    expected = unit(expected)
     off = np.degrees(np.arccos(np.clip((relief.bend(up, places) * expected).sum(axis=1), -1, 1)))
     assert off.max() < 4.5  # half a texel of 64 along both axes
 
@@ -174,10 +174,10 @@ def test_no_normal_turns_away_from_the_camera():
     rng = np.random.default_rng(1)
     normals = rng.normal(size=(4000, 3)).astype(np.float32)
     normals[:, 2] = np.abs(normals[:, 2])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit(normals)
     relief = draw_detail(6 * HEIGHT_SLOPES, 128, np.random.default_rng(3))
     bent = relief.bend(normals, rng.uniform(-1, 1, (4000, 3)).astype(np.float32))
-    np.testing.assert_allclose(np.linalg.norm(bent, axis=1), 1, atol=1e-5)
+    assert_allclose(np.linalg.norm(bent, axis=1), 1, atol=1e-5)
     assert (bent[:, 2] >= np.minimum(normals[:, 2], 0.1) - 1e-3).all()
     assert np.degrees(np.arccos(np.clip((bent * normals).sum(axis=1), -1, 1))).mean() > 3
 
@@ -219,8 +219,8 @@ def test_the_wider_side_fits_and_the_shape_is_kept():
         Mesh(vertices, box.faces.astype(np.int32), box.vertex_normals.astype(np.float32))
     )
     extent = np.ptp(mesh.vertices, axis=0)
-    np.testing.assert_allclose(extent, 2 * REACH * np.array((1, 0.25, 0.5)), rtol=1e-5)
-    np.testing.assert_allclose(mesh.vertices.min(axis=0), -mesh.vertices.max(axis=0), atol=1e-6)
+    assert_allclose(extent, 2 * REACH * np.array((1, 0.25, 0.5)), rtol=1e-5)
+    assert_allclose(mesh.vertices.min(axis=0), -mesh.vertices.max(axis=0), atol=1e-6)
 
 
 def test_a_ball_inside_out_is_turned(tmp_path):
@@ -249,7 +249,7 @@ def test_splitting_edges_changes_neither_surface_nor_shading():
     assert len(fine.faces) > 600
     assert area(fine) == pytest.approx(area(mesh), rel=1e-6)
     assert outward_volume(fine) == pytest.approx(outward_volume(mesh), rel=1e-6)
-    np.testing.assert_allclose(np.linalg.norm(fine.vertex_normals, axis=1), 1, atol=1e-6)
+    assert_allclose(np.linalg.norm(fine.vertex_normals, axis=1), 1, atol=1e-6)
     # What is fine enough already stays as it is, and the number of faces has its limit.
     assert len(split_long_edges(mesh, longest=2.0).faces) == len(mesh.faces)
     assert len(split_long_edges(mesh, longest=0.01, most_faces=5000).faces) <= 5000

@@ -3,14 +3,16 @@ and it says when it cannot go on.
 """
 
 import itertools
-import json
 import math
 from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
 import torch
+from torch.testing import assert_close
 
+from distributions import seeded
+from scenes import read_json
 from splinecli.errors import ModelError
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import load_weights, save_weights
@@ -33,7 +35,7 @@ class OneBatch(PixelGenerator):
     """Draws the same batch again and again."""
 
     def __init__(self, config: TrainingConfig) -> None:
-        super().__init__(config.pixels, torch.Generator().manual_seed(config.seed))
+        super().__init__(config.pixels, seeded(config.seed))
         self.batch = PixelGenerator.draw(self, config.batch_size)
 
     def draw(self, pixels: int) -> PixelBatch:
@@ -102,9 +104,7 @@ def test_a_run_taken_up_goes_on_as_if_never_stopped(tiny, tmp_path, make_set, up
     assert losses(second, 3) == pytest.approx(expected[3:], rel=1e-6)
     for network in ("network", "average"):
         for name, tensor in getattr(whole, network).state_dict().items():
-            torch.testing.assert_close(
-                getattr(second, network).state_dict()[name], tensor, rtol=1e-5, atol=1e-7
-            )
+            assert_close(getattr(second, network).state_dict()[name], tensor, rtol=1e-5, atol=1e-7)
 
 
 def test_a_run_begins_with_the_weights_it_is_given(tiny, tmp_path):
@@ -210,10 +210,7 @@ def test_a_run_writes_its_files(tiny, tmp_path, monkeypatch):
     again = trainer.task.validation_deg(loaded, bfloat16=False)
     assert again == pytest.approx(last.validation_deg, abs=0.05)  # float16
     assert rows[-1].loss == pytest.approx(last.loss, rel=1e-5)
-    assert (
-        TrainingConfig.from_dict(json.loads((tmp_path / "config.json").read_text()))
-        == trainer.config
-    )
+    assert TrainingConfig.from_dict(read_json(tmp_path / "config.json")) == trainer.config
 
 
 def test_minutes_bound_a_run(tiny, tmp_path, monkeypatch):
@@ -290,12 +287,12 @@ def test_the_average_follows_the_weights(tiny, tmp_path):
         ]
     assert math.isclose(decay, 4 / 13) or decay == 0.3
     for average, wanted in zip(trainer.average.parameters(), expected, strict=True):
-        torch.testing.assert_close(average, wanted)
+        assert_close(average, wanted)
 
 
 def test_validation_is_the_mean_angle_to_the_truth(tiny):
     network, task = SplineNet(tiny.network).train(), PixelTask(tiny, range(1), CPU)
-    batch = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(3)).draw(40)
+    batch = PixelGenerator(tiny.pixels, seeded(3)).draw(40)
     task.validation = [batch]
     found = task.validation_deg(network, bfloat16=False)
     with torch.no_grad():

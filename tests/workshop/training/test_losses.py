@@ -8,7 +8,9 @@ import pytest
 import torch
 from scipy.ndimage import map_coordinates
 from torch import Tensor, nn
+from torch.testing import assert_close
 
+from distributions import seeded
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet, to_pixel_frame
 from splinecli.maths.observation_map import cell_directions, sparse_map
@@ -38,7 +40,7 @@ def at(zenith_deg: float, azimuth_deg: float = 0.0) -> Tensor:
 
 
 def random_maps(*shape: int, seed: int = 0) -> Tensor:
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return torch.rand(*shape, generator=seeded(seed), dtype=torch.float64)
 
 
 # A sine of 1e-6 stands in for zero, so that the gradient is bounded: 6e-5 degrees.
@@ -133,7 +135,7 @@ def network() -> SplineNet:
 
 @pytest.fixture
 def batch(tiny: TrainingConfig) -> PixelBatch:
-    return PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0)).draw(12)
+    return PixelGenerator(tiny.pixels, seeded(0)).draw(12)
 
 
 def moved(module: nn.Module) -> bool:
@@ -217,7 +219,7 @@ def test_the_total_is_the_weighted_sum_of_its_terms(
     assert found.angle.item() == pytest.approx(angle.item(), abs=1e-4)
     terms = (found.on_map, found.masked, found.symmetric, found.asymmetric)
     expected = ((on_map / cells).mean(), (masked / seen).mean(), symmetric, asymmetric)
-    torch.testing.assert_close(terms, expected, rtol=1e-5, atol=0)
+    assert_close(terms, expected, rtol=1e-5, atol=0)
     total = 0.7 * found.angle + 0.02 * symmetric + 1e-3 * asymmetric
     if part != "ne_net":
         total += 0.5 * (on_map if li_net_norm == "sum" else on_map / cells).mean()
@@ -241,7 +243,7 @@ def test_truth_agrees_with_what_the_network_sees(tiny, mirror):
     # Without a camera's faults, the true dense map at a light in a cell's centre is the sparse map
     # there.
     network = SplineNet(tiny.network)
-    batch = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0)).draw(40)
+    batch = PixelGenerator(tiny.pixels, seeded(0)).draw(40)
     directions, inside = cell_directions()
     lights = directions[inside][3::29]
     exposure = torch.linspace(0.3, 2, 40)[:, None]
@@ -270,10 +272,8 @@ def test_truth_agrees_with_what_the_network_sees(tiny, mirror):
         )
     sparse = sparse_map(observations / views.scale, turned)
     assert sparse.occupied[0].sum() == len(lights)
-    torch.testing.assert_close(
-        dense.values * sparse.occupied, sparse.values.clamp(max=1), rtol=2e-3, atol=1e-4
-    )
-    torch.testing.assert_close(normals, expected_normals)
+    assert_close(dense.values * sparse.occupied, sparse.values.clamp(max=1), rtol=2e-3, atol=1e-4)
+    assert_close(normals, expected_normals)
     assert dense.values.max() == 1  # highlights that no light has hit are cut
     assert torch.equal(dense.known, inside.float().expand(40, 1, 32, 32))
     assert torch.equal(dense.filled, dense.known)

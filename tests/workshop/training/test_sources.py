@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from distributions import generator as seeded
+from distributions import seeded
 from splinecli.errors import InputError
 from splinecli.workshop.pixel_sets.store import Entry, PixelSet
 from splinecli.workshop.synthesis.batches import PixelBatch
