@@ -88,6 +88,11 @@ def shade(
     return np.asarray(np.clip(seen, 0, None))
 
 
+def to_uint16(values: NDArray[Any]) -> NDArray[np.uint16]:
+    """Round values to those that a 16-bit image stores."""
+    return np.rint(values).astype(np.uint16)
+
+
 def read_image(path: str | Path) -> Any:
     """The pixels of an image as OpenCV reads them: BGR, in their own type."""
     return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
@@ -182,7 +187,7 @@ def write_bump(folder: Path, positions: Floats = BUMP_LAMPS, *, distant: bool = 
     distance = np.linalg.norm(towards, axis=3)
     shading = np.clip((towards * normals).sum(axis=3) / distance, 0, None)
     pictures = shading * (1 if distant else 150.0**2 / distance**2)
-    stored = np.rint(pictures * 30_000).astype(np.uint16)
+    stored = to_uint16(pictures * 30_000)
     return write_capture(
         folder, stored, None, normals=normals.astype(np.float32), names="{}.png", first=1
     )

@@ -17,7 +17,7 @@ import tifffile
 from PIL import Image
 
 import scenes
-from scenes import write_image
+from scenes import to_uint16, write_image
 from splinecli.capture import CaptureSource, Overrides, find_capture_files, open_capture
 from splinecli.capture.formats.images import decode_image
 from splinecli.capture.light_files import read_light_positions
@@ -33,7 +33,7 @@ from splinecli.recipe import RecipeOptions, prepare_capture
 SIZE = 32
 LIGHTS = scenes.spiral_lights(12, 40)
 NORMALS, DISC = scenes.sphere(SIZE, 0.6)
-PICTURES = np.rint(np.moveaxis(scenes.shade(NORMALS, LIGHTS), -1, 0) * 50_000).astype(np.uint16)
+PICTURES = to_uint16(np.moveaxis(scenes.shade(NORMALS, LIGHTS), -1, 0) * 50_000)
 MASK = DISC.astype(np.uint8) * 255
 
 Change = Callable[[Path], Path | None]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from scenes import write_image
+from scenes import to_uint16, write_image
 from splinecli.capture import open_capture
 from splinecli.errors import InputError
 from splinecli.recipe import prepare_capture, read_capture
@@ -55,7 +55,7 @@ def test_identical_lights(tmp_path, light, as_stored):
     rng = np.random.default_rng(0)
     for number in range(8):
         shading = np.linspace(0.1, 1, 900).reshape(30, 30) * rng.uniform(0.5, 1.5)
-        write_image(tmp_path / f"{number}.png", np.rint(shading * 40_000).astype(np.uint16))
+        write_image(tmp_path / f"{number}.png", to_uint16(shading * 40_000))
     np.savetxt(tmp_path / "lights.txt", [light] * 8)
     with pytest.raises(InputError, match="the 8 lights are in one plane"):
         read_capture(tmp_path, as_stored=as_stored)

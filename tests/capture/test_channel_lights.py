@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scenes import Floats, read_json, ring_lights, shade, sphere, write_capture
+from scenes import Floats, read_json, ring_lights, shade, sphere, to_uint16, write_capture
 from splinecli.capture.channel_lights import channel_lights
 from splinecli.errors import InputError, UsageError
 from splinecli.lights.calibration.balls import find_ball_files
@@ -31,7 +31,7 @@ def photograph(
     """
     shading = shade(NORMALS, lights).reshape(*MASK.shape, -1, 3) * MASK[..., None, None]
     images = np.moveaxis(shading, 2, 0) @ crosstalk.T * paint
-    return np.rint(images * 30_000).astype(np.uint16)
+    return to_uint16(images * 30_000)
 
 
 def write(folder: Path, count: int, paint: Floats | float = 1.0) -> Path:

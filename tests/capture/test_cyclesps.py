@@ -10,7 +10,7 @@ import pytest
 import tifffile
 from numpy.testing import assert_allclose, assert_array_equal
 
-from scenes import write_image
+from scenes import to_uint16, write_image
 from splinecli.capture import capture_name, find_captures, open_capture
 from splinecli.errors import InputError
 from splinecli.recipe import read_capture
@@ -45,7 +45,7 @@ def write_object(
     """An object as published; returns the images (F, H, W, 3) of each kind."""
     folder.mkdir(parents=True)
     np.savetxt(folder / "light.txt", LIGHTS[:n_lights], fmt="%.6f")
-    encoded = np.rint((normals() + 1) / 2 * 65535).astype(np.uint16)
+    encoded = to_uint16((normals() + 1) / 2 * 65535)
     tifffile.imwrite(folder / "gt_normal.tif", encoded, photometric="rgb")
     for name, boundary in zip(("inboundary.png", "onboundary.png"), boundaries(), strict=True):
         write_image(folder / name, boundary)

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scenes import halfway, read_image, read_json, write_capture, write_image
+from scenes import halfway, read_image, read_json, to_uint16, write_capture, write_image
 from splinecli.capture import read_light_directions
 
 SIZE, CENTRE, RADIUS = (100, 120), (60.0, 48.0), 40.0
@@ -29,7 +29,7 @@ def write_balls(folder: Path, lights=LIGHTS, *, wall: float = 0.2) -> Path:
     for number, half in enumerate(halfway(lights)):
         spot = np.exp(-((np.degrees(np.arccos((n @ half).clip(-1, 1))) / 2) ** 2))
         picture = np.where(inside, 0.02 + 0.9 * spot, wall)
-        write_image(folder / f"{number}.png", np.rint(picture * 65535).astype(np.uint16))
+        write_image(folder / f"{number}.png", to_uint16(picture * 65535))
     return folder
 
 
@@ -41,9 +41,7 @@ def write_gray(folder: Path, intensities) -> Path:
         * (n @ LIGHTS.T).clip(0).transpose(2, 0, 1)
         * inside
     )
-    return write_capture(
-        folder, np.rint(images * 65535).astype(np.uint16), None, mask=inside, names="{}.png"
-    )
+    return write_capture(folder, to_uint16(images * 65535), None, mask=inside, names="{}.png")
 
 
 def angles_deg(found, expected=LIGHTS):

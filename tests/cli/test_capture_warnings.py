@@ -12,7 +12,16 @@ import numpy as np
 import pytest
 
 import splinecli
-from scenes import read_image, read_json, shade, sphere, spiral_lights, write_capture, write_image
+from scenes import (
+    read_image,
+    read_json,
+    shade,
+    sphere,
+    spiral_lights,
+    to_uint16,
+    write_capture,
+    write_image,
+)
 from splinecli.judge import checks
 from test_notebook import read_medallion
 
@@ -160,7 +169,7 @@ def ball(*, background: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stored(images: np.ndarray, full_scale: int = 65_535) -> np.ndarray:
-    return np.rint(images * full_scale).astype(np.uint16)
+    return to_uint16(images * full_scale)
 
 
 def codes_of(run, *command: object) -> list[str]:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scenes import read_json, write_capture, write_image
+from scenes import read_json, to_uint16, write_capture, write_image
 from splinecli.maths.normals import unit
 
 
@@ -51,7 +51,7 @@ def overexposed(make_capture):
         np.clip(0.9 * intensities * (normals @ np.loadtxt(folder / "light_directions.txt").T), 0, 1)
         * 65535
     )
-    pictures = np.rint(np.moveaxis(images, 2, 0)).astype(np.uint16)
+    pictures = to_uint16(np.moveaxis(images, 2, 0))
     return write_capture(
         folder, pictures, None, normals=normals.astype(np.float32), names="image{}.png", first=1
     )

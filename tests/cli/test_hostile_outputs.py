@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from scenes import to_uint16
 from splinecli.evaluation.trials import TrialStore
 from system.test_publishing import LINKS
 
@@ -82,7 +83,7 @@ def inputs(capture, monkeypatch):
     for number in range(3):
         spot = np.exp(-((x - 50 - 10 * number) ** 2 + (y - 48) ** 2) / 20)
         picture = np.where(np.hypot(x - 60, y - 48) < 40, 0.02 + 0.9 * spot, 0.2)
-        cv2.imwrite(f"ball/{number}.png", np.rint(picture * 65535).astype(np.uint16))
+        cv2.imwrite(f"ball/{number}.png", to_uint16(picture * 65535))
     return capture
 
 

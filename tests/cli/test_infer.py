@@ -17,7 +17,7 @@ import tifffile
 from numpy.testing import assert_allclose, assert_array_equal
 
 from cli.conftest import EXAMPLE, read_report
-from scenes import read_image, read_json, write_image
+from scenes import read_image, read_json, to_uint16, write_image
 from splinecli.capture.files import IMAGE_SUFFIXES
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.maths.normals import angle_between_deg, decode_picture
@@ -151,7 +151,7 @@ def test_photographs_with_a_curve_and_ambient_light(capture, document):
     light = 9_000 / 65_535
     for path in capture.glob("image*.png"):
         linear = read_image(path) / 65_535 * 0.8 + light
-        write_image(path, np.rint(65_535 * linear ** (1 / 2.2)).astype(np.uint16))
+        write_image(path, to_uint16(65_535 * linear ** (1 / 2.2)))
     dark = np.full((24, 24), round(65_535 * light ** (1 / 2.2)), np.uint16)
     cv2.imwrite("dark.png", dark)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scenes import read_image, spiral_lights, write_capture, write_image
+from scenes import read_image, spiral_lights, to_uint16, write_capture, write_image
 
 
 def test_the_report_of_a_capture(run, capture):
@@ -38,7 +38,7 @@ def test_the_same_as_json(document, capture):
 
 def test_few_lights_near_the_axis(run, document, truth):
     lights = spiral_lights(6, 20)
-    images = np.rint(np.moveaxis(truth @ lights.T, 2, 0).clip(0) * 60_000).astype(np.uint16)
+    images = to_uint16(np.moveaxis(truth @ lights.T, 2, 0).clip(0) * 60_000)
     write_capture(Path("near"), images, lights, mask=truth[..., 2] > 0.3)
     warnings = [
         "There are 6 lights; use 8 or more, well spread.",

@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from cli.conftest import EXAMPLE, read_report
-from scenes import BUMP_LAMPS, read_image, write_bump, write_image
+from scenes import BUMP_LAMPS, read_image, to_uint16, write_bump, write_image
 
 
 def write_lights(folder: Path, change) -> None:
@@ -59,7 +59,7 @@ def test_an_order_is_named_although_the_intensities_are_unequal_and_unknown(
     (medallion / "light_intensities.txt").unlink()
     for number in (3, 7, 8):
         path = str(medallion / f"{number:02}.png")
-        cv2.imwrite(path, np.rint(0.6 * cv2.imread(path, cv2.IMREAD_UNCHANGED)).astype(np.uint16))
+        cv2.imwrite(path, to_uint16(0.6 * cv2.imread(path, cv2.IMREAD_UNCHANGED)))
     for command in (("info", medallion), ("infer", medallion, "--method", "ls")):
         assert "light" not in run(*command, *options).err.replace(
             "The light intensities were estimated", ""

@@ -12,7 +12,7 @@ import tifffile
 from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
-from scenes import Floats, shade, sphere_cap, spiral_lights, with_chunk, write_capture
+from scenes import Floats, shade, sphere_cap, spiral_lights, to_uint16, with_chunk, write_capture
 from splinecli.capture.formats.images import decode_image, to_linear
 from splinecli.capture.reader import open_capture
 from splinecli.errors import InputError
@@ -110,7 +110,7 @@ def patches_of_a_cube() -> NDArray[np.uint16]:
 def normalised_to_12_bits() -> NDArray[np.uint16]:
     """Each image scaled so that its brightest pixel is 4095."""
     images = sphere(noise=0)[0]
-    return np.rint(images / images.max(axis=(1, 2), keepdims=True) * 4095).astype(np.uint16)
+    return to_uint16(images / images.max(axis=(1, 2), keepdims=True) * 4095)
 
 
 @pytest.mark.parametrize(
@@ -118,7 +118,7 @@ def normalised_to_12_bits() -> NDArray[np.uint16]:
     [
         pytest.param(bright(4000), id="12 bits, not clipped"),
         pytest.param(bright(37), id="dark"),
-        pytest.param(np.rint(sphere(noise=0)[0] * 500).astype(np.uint16), id="dark, without noise"),
+        pytest.param(to_uint16(sphere(noise=0)[0] * 500), id="dark, without noise"),
         pytest.param(normalised_to_12_bits(), id="each normalised"),
         pytest.param(with_background(0), id="black background"),
         pytest.param(with_background(25_000), id="flat bright background"),

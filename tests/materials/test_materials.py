@@ -12,7 +12,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from glb_file import read_glb
-from scenes import cap_directions, read_json, sphere, write_capture
+from scenes import cap_directions, read_json, sphere, to_uint16, write_capture
 from splinecli import estimate_material
 from splinecli.capture import open_capture
 from splinecli.errors import InputError, UsageError
@@ -219,7 +219,7 @@ def glossy(tmp_path: Path) -> Path:
     """A gray capture of a glossy sphere."""
     images = np.zeros((len(LIGHTS), SIZE, SIZE))
     images[:, MASK] = ggx_sphere(LIGHTS, diffuse=0.3, f0=0.05, roughness=0.4).T
-    stored = np.rint(images.clip(0, 1) * 65535).astype(np.uint16)
+    stored = to_uint16(images.clip(0, 1) * 65535)
     return write_capture(
         tmp_path / "ball", stored, LIGHTS, mask=MASK, normals=NORMAL_MAP * MASK[..., None]
     )

@@ -1,5 +1,6 @@
 """Captures that arrive in a folder: when each is complete, and that it is returned once."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -54,8 +55,8 @@ def test_the_files_of_a_capture_that_is_done_are_left_alone(tmp_path, monkeypatc
     """A folder of a thousand captures would be read again each second."""
     clock, walked = Clock(), list[Path]()
     arrivals = Arrivals(tmp_path, marker=None, seconds=0, without=tmp_path / "out", clock=clock)
-    walk = incoming._stamp
-    monkeypatch.setattr(incoming, "_stamp", lambda capture: walked.append(capture) or walk(capture))
+    walk = os.walk
+    monkeypatch.setattr(os, "walk", lambda capture: walked.append(capture) or walk(capture))
     done, other = tmp_path / "done", tmp_path / "other"
     put(done / "images/1.png")
     put(other / "1.png")

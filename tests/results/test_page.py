@@ -422,7 +422,7 @@ def test_pictures_of_earlier_results_that_are_none_of_ours_are_not_shown(tmp_pat
     content[16:24] = (20_000).to_bytes(4, "big") * 2  # the size, in a file of few bytes
     content[29:33] = zlib.crc32(content[12:29]).to_bytes(4, "big")
     picture.write_bytes(content)
-    with mock.patch("splinecli.capture.formats.images._decode", side_effect=AssertionError):
+    with mock.patch("cv2.imdecode", side_effect=AssertionError):
         assert "data:image/jpeg" not in index_page([entry], tmp_path)
     tifffile.imwrite(picture, np.zeros((9, 9, 3), np.float32), photometric="rgb")
     assert "data:image/jpeg" not in index_page([entry], tmp_path)

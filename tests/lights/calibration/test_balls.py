@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from lights.calibration.conftest import Render
-from scenes import decode_rgb, write_image
+from scenes import decode_rgb, to_uint16, write_image
 from splinecli.capture import read_light_directions
 from splinecli.errors import InputError
 from splinecli.lights.calibration.balls import calibrate_ball, combine_balls, find_ball_files
@@ -21,7 +21,7 @@ BALL = Circle(103.3, 88.7, 61.4)
 
 def write(folder: Path, name: str, picture: NDArray[np.floating]) -> Path:
     folder.mkdir(exist_ok=True)
-    write_image(folder / name, np.rint(picture.clip(0, 1) * 65535).astype(np.uint16))
+    write_image(folder / name, to_uint16(picture.clip(0, 1) * 65535))
     return folder
 
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
-from scenes import Floats, write_capture, write_image
+from scenes import Floats, to_uint16, write_capture, write_image
 from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.errors import InputError
 from splinecli.lights.calibration.balls import find_ball_files
@@ -20,9 +20,7 @@ LIGHTS = np.array([(0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (0.0, -0.48, np.sqrt(1 - 0.
 
 
 def write(folder: Path, images: Floats, mask: NDArray[np.bool_] | None) -> Path:
-    return write_capture(
-        folder, np.rint(images * 65535).astype(np.uint16), None, mask=mask, names="{}.png"
-    )
+    return write_capture(folder, to_uint16(images * 65535), None, mask=mask, names="{}.png")
 
 
 def ball_images() -> Floats:

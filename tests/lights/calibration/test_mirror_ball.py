@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scenes import write_image
+from scenes import to_uint16, write_image
 from splinecli.errors import InputError
 from splinecli.lights.calibration.balls import (
     ball_centre,
@@ -55,7 +55,7 @@ def test_sparkles_and_windows_are_no_lamps(render_ball, lights):
 
 def test_highlights_near_the_rim(tmp_path, render_ball):
     picture = render_ball(unit(np.array((1.0, 0.0, -0.3))), lamp=0.9)
-    write_image(tmp_path / "1.png", np.rint(picture * 65535).astype(np.uint16))
+    write_image(tmp_path / "1.png", to_uint16(picture * 65535))
     with pytest.raises(InputError, match=r"1\.png: .*level with the ball or behind it"):
         calibrate_ball(find_ball_files(tmp_path), circle=BALL)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from scenes import write_image
+from scenes import to_uint16, write_image
 from splinecli.errors import InputError
 from splinecli.maths.normals import unit
 from splinecli.workshop.synthesis import meshes
@@ -148,7 +148,7 @@ def test_slopes_are_found_whichever_way_green_points(tmp_path, green_up):
     normals[..., 1] *= -1 if green_up else 1
     normals = unit(normals)
     path = tmp_path / "waves.png"
-    write_image(path, np.rint((normals + 1) / 2 * 65535).astype(np.uint16)[..., ::-1])  # type: ignore[operator]
+    write_image(path, to_uint16((normals + 1) / 2 * 65535)[..., ::-1])  # type: ignore[operator]
     assert_allclose(read_relief(path), HEIGHT_SLOPES, atol=1e-3)
 
 
