@@ -145,33 +145,6 @@ def test_usage_errors(run):
         assert run(*arguments.split()) == (2, "", f"splinecli: {message}\n")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--workers", "0"), "--workers is '0'; expected a number of at least 1, or auto"),
-        (("--workers", "many"), "--workers is 'many'; expected a number of at least 1, or auto"),
-        (
-            ("--workers", "2", "--cluster", "tcp://a:1"),
-            "--workers and --cluster contradict each other",
-        ),
-        (("--shard", "3/2"), "--shard is 3/2; expected I/N with I from 1 to N"),
-        (("--shard", "half"), "--shard is 'half'; expected I/N"),
-        (
-            ("--cluster", "none.json"),
-            "--cluster is none.json; expected an address such as tcp://scheduler:8786",
-        ),
-    ],
-)
-def test_refused_options_of_clusters(arguments, message, capture, make_capture, run):
-    if "--cluster" in arguments:
-        pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    make_capture("second")
-    result = run("infer", capture, "second", "--method", "ls", *arguments)
-    assert (result.code, result.out, result.err.count("\n")) == (2, "", 1)
-    assert message in result.err
-    assert not Path("out").exists()
-
-
 @pytest.mark.parametrize("option", ["--crosstalk", "--mask", "--output"])
 def test_an_option_is_not_the_value_of_the_one_before(option, capture, run):
     result = run("infer", capture, "--lights-in-channels", option, "--strict")

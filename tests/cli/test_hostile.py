@@ -100,15 +100,6 @@ def test_a_pipe_that_is_too_long_is_refused_not_cut(capture):
     assert not Path("out").exists()
 
 
-@posix
-def test_a_pipe_in_place_of_stored_scores_is_replaced(capture, run):
-    Path("evaluation").mkdir()
-    os.mkfifo("evaluation/trials.jsonl")
-    result = run("evaluate", capture, "--method", "ls", "--n-lights", 4, "--trials", 1)
-    assert (result.code, result.err) == (0, "")
-    assert Path("evaluation/trials.jsonl").is_file()
-
-
 def test_a_zero_byte_in_a_list_of_images(capture, run):
     (capture / "filenames.txt").write_text("image1.png\na\0b.png\n")
     result = run("infer", capture, "--method", "ls")
