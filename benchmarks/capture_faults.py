@@ -26,7 +26,7 @@ from splinecli.capture.arrays import ArraySource
 from splinecli.capture.sample import Sample
 from splinecli.images.lamps import estimate_light_intensities
 from splinecli.judge.checks import check_capture
-from splinecli.judge.readings import ALL_KINDS, COSTS, POWERS, Kind, Reading, Readings
+from splinecli.judge.explanations import ALL_KINDS, COSTS, POWERS, Explanation, Explanations, Kind
 from splinecli.lights.draws import draw_lights
 from splinecli.maths.transfer import encode_srgb
 from splinecli.recipe import prepare_capture
@@ -175,7 +175,9 @@ KINDS: dict[str, Kind | None] = {
 PRIOR = {"right": 0.7, "encoded": 0.12, "near": 0.06, "constant": 0.06, "unequal": 0.06}
 
 
-def readings_of(scene: Rendered, rng: np.random.Generator) -> Iterator[tuple[str, list[Reading]]]:
+def readings_of(
+    scene: Rendered, rng: np.random.Generator
+) -> Iterator[tuple[str, list[Explanation]]]:
     """Yield the readings of a scene as it is and with each fault of KINDS."""
     chosen = rng.choice(N_LIGHTS, int(rng.choice((8, 10, 12, 16))), replace=False)
     right, near = (
@@ -197,10 +199,10 @@ def readings_of(scene: Rendered, rng: np.random.Generator) -> Iterator[tuple[str
             0, 1
         )
         values = encode_srgb(images) / 255.0 if kind == "encoded" else images
-        yield kind, Readings(Sample(values, scene.mask, 1), scene.lights[chosen]).fit(ALL_KINDS)
+        yield kind, Explanations(Sample(values, scene.mask, 1), scene.lights[chosen]).fit(ALL_KINDS)
 
 
-def fit(found: Sequence[tuple[str, list[Reading]]]) -> None:
+def fit(found: Sequence[tuple[str, list[Explanation]]]) -> None:
     """Print the costs and powers with which the readings of captures are likeliest right."""
     cases = [
         (kind, {each.kind: each for each in reversed(readings)})

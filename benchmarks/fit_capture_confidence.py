@@ -22,15 +22,13 @@ from torch import Tensor
 
 from splinecli.estimate.confidence import capture_features
 from splinecli.estimate.methods.estimator import CONFIDENT_DEG
-from splinecli.estimate.networks.li_ne_net import (
-    CaptureHead,
-    error_negative_log_likelihood,
-    probability_within,
-)
+from splinecli.estimate.networks.li_ne_net import CaptureHead, probability_within
 from splinecli.estimate.networks.weights import HEAD_FORMAT, manifest
 from splinecli.lights.lighting import PixelIndices, PixelLighting, PixelPlaces
 from splinecli.system.files import file_sha256
-from splinecli.system.weight_files import SHIPPED, serialise, tensors_sha256
+from splinecli.system.weight_files import SHIPPED, tensors_sha256
+from splinecli.workshop.save_weights import serialise
+from splinecli.workshop.training.objective import error_negative_log_likelihood
 
 Floats = NDArray[np.floating]
 

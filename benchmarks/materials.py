@@ -28,7 +28,7 @@ from splinecli.estimate.methods import make_estimator
 from splinecli.evaluation.figures import lambertian, likeness
 from splinecli.materials.lobes import Geometry
 from splinecli.materials.maps import estimate_material, lights_that_reach, render_gray
-from splinecli.materials.principled import PrincipledMaterial
+from splinecli.workshop.synthesis.principled import PrincipledMaterial
 from splinecli.workshop.synthesis.ray_tracing import Tracer, find_visible_surface
 from splinecli.workshop.synthesis.scenes import RenderedScene, SceneConfig, draw_scene, render_scene
 

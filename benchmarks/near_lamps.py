@@ -22,9 +22,9 @@ from splinecli.capture import Capture
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.estimate.inference import NormalEstimate, estimate_normals
 from splinecli.estimate.methods import make_estimator
-from splinecli.materials.principled import PrincipledMaterial
 from splinecli.surface.integration import integrate_normals
 from splinecli.workshop.synthesis.meshes import Mesh
+from splinecli.workshop.synthesis.principled import PrincipledMaterial
 from splinecli.workshop.synthesis.ray_tracing import Tracer, VisibleSurface, find_visible_surface
 from splinecli.workshop.synthesis.scenes import render_direct
 

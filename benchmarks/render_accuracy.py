@@ -22,8 +22,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splinecli.materials.principled import PrincipledMaterial
 from splinecli.workshop.synthesis.draw_materials import CLASSES
+from splinecli.workshop.synthesis.principled import PrincipledMaterial
 from splinecli.workshop.synthesis.scenes import Scene, SceneConfig, draw_scene, render_scene
 
 LEVELS = 6

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
 from splinecli.lights.light_net import LIGHT_FORMAT, LightNet, network_inputs, square_images
-from splinecli.system.weight_files import save_module
+from splinecli.workshop.save_weights import save_module
 from splinecli.workshop.synthesis import draw_number, shapes
 from splinecli.workshop.synthesis.draw_materials import CLASSES
 from splinecli.workshop.synthesis.lights import choose_in_cone, draw_light_directions

@@ -25,7 +25,8 @@ from splinecli.estimate.networks.set_branch import PixelTokens
 from splinecli.estimate.networks.weights import resolve_weights
 from splinecli.materials.material_net import MATERIAL_FORMAT, Gloss, MaterialNet
 from splinecli.system.files import file_sha256
-from splinecli.system.weight_files import SHIPPED, save_module
+from splinecli.system.weight_files import SHIPPED
+from splinecli.workshop.save_weights import save_module
 from splinecli.workshop.synthesis import draw_uniform
 from splinecli.workshop.synthesis.batches import PixelBatch
 from splinecli.workshop.synthesis.lights import draw_light_counts, draw_light_directions

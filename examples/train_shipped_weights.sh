@@ -72,7 +72,8 @@ run "optics${4:-}" "$folder/random" "$folder/views" --preset refine --start-from
 "$python" - "$start" "$folder/optics${4:-}/weights.safetensors" "$folder/weights.safetensors" <<'END'
 import sys
 from pathlib import Path
-from splinecli.estimate.networks.weights import load_weights, save_weights
+from splinecli.estimate.networks.weights import load_weights
+from splinecli.workshop.save_weights import save_weights
 
 network, other = (load_weights(Path(name)).network for name in sys.argv[1:3])
 parameters = other.state_dict()

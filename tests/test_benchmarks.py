@@ -16,7 +16,7 @@ from scenes import read_json
 from splinecli import __version__
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
-from splinecli.estimate.networks.weights import save_weights
+from splinecli.workshop.save_weights import save_weights
 
 ROOT = Path(__file__).resolve().parents[1]
 MEDALLION = str(ROOT / "examples/medallion")

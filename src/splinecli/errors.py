@@ -43,8 +43,8 @@ class SplinecliError(Exception):
     def __init__(
         self,
         problem: str,
-        *,
         path: str | Path | None = None,
+        *,
         line: int | None = None,
         hint: str | None = None,
     ) -> None:

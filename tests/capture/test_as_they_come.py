@@ -18,7 +18,13 @@ from PIL import Image
 
 import scenes
 from scenes import to_uint16, write_image
-from splinecli.capture import CaptureSource, Overrides, find_capture_files, open_capture
+from splinecli.capture import (
+    CaptureOptions,
+    CaptureSource,
+    Overrides,
+    find_capture_files,
+    open_capture,
+)
 from splinecli.capture.formats.images import decode_image
 from splinecli.capture.light_files import read_light_positions
 from splinecli.errors import InputError, UsageError
@@ -86,7 +92,9 @@ def test_two_masks_are_named_and_none_is_used(folder):
         "mask_left.png, mask_right.png: none is used as the mask. Choose one with --mask FILE."
     )
     assert str(source.warnings[0]) == expected
-    assert check(open_capture(folder, mask=folder / "mask_left.png")) == ["images_left_out"]
+    assert check(open_capture(folder, CaptureOptions(mask=folder / "mask_left.png"))) == [
+        "images_left_out"
+    ]
 
 
 def test_alpha_is_a_mask_if_there_is_no_other(folder):
@@ -116,7 +124,7 @@ def test_images_in_a_folder_of_their_own(folder, listed):
 
 def test_bmp_ground_truth(folder):
     picture(folder / "normals_gt.bmp", np.rint((NORMALS[..., ::-1] + 1) * 127.5).astype(np.uint8))
-    truth = prepare_capture(open_capture(folder, mask=None)).ground_truth
+    truth = prepare_capture(open_capture(folder, CaptureOptions(mask=None))).ground_truth
     assert truth is not None and angle_between_deg(truth[DISC], NORMALS[DISC]).max() < 1
 
 
@@ -271,7 +279,9 @@ def test_intensities_of_the_json_count_unless_a_file_is_given(folder, tmp_path):
     assert open_capture(folder).light_intensities.tolist() == [[2.0, 1.0, 0.5]] * 12
     (tmp_path / "intensities.txt").write_text("3\n" * 12)
     assert (
-        open_capture(folder, intensities=tmp_path / "intensities.txt").light_intensities.tolist()
+        open_capture(
+            folder, CaptureOptions(intensities=tmp_path / "intensities.txt")
+        ).light_intensities.tolist()
         == [[3.0] * 3] * 12
     )
 
@@ -311,7 +321,7 @@ def test_light_files_that_are_named(folder, name, text, hint):
         open_capture(folder)
     _, lights, *form = str(refused.value.hint).removeprefix("Add ").split()
     options = {"lights_format": form[1]} if form else {}
-    assert check(open_capture(folder, lights=lights, **options), None) == []
+    assert check(open_capture(folder, CaptureOptions(lights=lights, **options)), None) == []
 
 
 def test_a_dome_has_positions(folder):
@@ -405,7 +415,7 @@ def test_images_of_other_formats(folder, form):
         path.unlink()
     WRITERS[form](folder)
     picture(folder.parent / "mask.png", MASK)
-    source = open_capture(folder, mask=folder.parent / "mask.png")
+    source = open_capture(folder, CaptureOptions(mask=folder.parent / "mask.png"))
     assert source.n_lights == 12
     check(source)
     if form == "12-bit PGM":
@@ -426,7 +436,8 @@ def test_display_encoded_formats(folder, suffix):
         Image.fromarray(np.dstack([image] * 3)).save(folder / f"{number:03}{suffix}", **options)
     picture(folder.parent / "mask.png", MASK)
     capture = prepare_capture(
-        open_capture(folder, mask=folder.parent / "mask.png"), options=RecipeOptions(as_stored=True)
+        open_capture(folder, CaptureOptions(mask=folder.parent / "mask.png")),
+        options=RecipeOptions(as_stored=True),
     )
     assert "display_decoded" in [warning.code for warning in capture.warnings]
     normals = estimate_normals(capture, make_estimator("ls")).normal_map

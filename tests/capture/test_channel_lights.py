@@ -15,7 +15,7 @@ from splinecli.lights.calibration.balls import find_ball_files
 from splinecli.lights.calibration.crosstalk import measure_crosstalk
 from splinecli.maths.normals import angle_between_deg
 from splinecli.pipeline.infer import infer_capture
-from splinecli.pipeline.infer_options import InferOptions, InfoOptions, Reading
+from splinecli.pipeline.infer_options import InferOptions, InfoOptions, ReadingOptions
 from splinecli.pipeline.info import describe_capture, summary_lines
 
 NORMALS, MASK = sphere(90)
@@ -71,7 +71,7 @@ def test_a_colour_image_gives_the_normals_of_a_gray_sphere(count, tmp_path):
 
 def test_messages_count_the_lights_of_channels(tmp_path):
     folder = write(tmp_path / "gray", 1)
-    reading = Reading(lights_in_channels=True)
+    reading = ReadingOptions(lights_in_channels=True)
     report = describe_capture(InfoOptions(capture=folder), reading)
     assert report["images"] == 1 and "few_lights" not in report["warning_codes"]
     assert "images       1 (000.png): 90 x 90, RGB" in summary_lines(report)[1]

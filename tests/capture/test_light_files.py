@@ -17,7 +17,7 @@ from scipy.io import savemat
 
 from scenes import write_image
 from splinecli.capture import read_light_directions, read_light_intensities
-from splinecli.capture.light_files import check_writable, match_images, read_lights
+from splinecli.capture.light_files import light_encoder, match_images, read_lights
 from splinecli.errors import InputError
 
 DIRECTIONS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, -0.6, 0.8], [-0.48, 0.36, 0.8]])
@@ -253,7 +253,7 @@ def test_factors_of_a_dome_are_inverse_intensities(tmp_path, factors, message):
 def test_written_lights_are_read_again(tmp_path, suffix):
     path = tmp_path / f"lights{suffix}"
     path.write_bytes(
-        check_writable(path)(DIRECTIONS, [Path(f"{number}.png") for number in range(4)])
+        light_encoder(path)(DIRECTIONS, [Path(f"{number}.png") for number in range(4)])
     )
     assert_allclose(read_lights(path, 4)[1], DIRECTIONS, atol=1e-8)
     if suffix == ".csv":

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from scenes import with_chunk, write_capture
-from splinecli.capture import CaptureWarning, RadiometricCalibration, open_capture
+from splinecli.capture import CaptureOptions, CaptureWarning, RadiometricCalibration, open_capture
 from splinecli.capture.formats.facts import read_header
 from splinecli.capture.linearise import linear_light
 from splinecli.errors import InputError
@@ -46,7 +46,7 @@ def codes(warnings: Iterable[CaptureWarning]) -> list[str]:
 
 def observed(folder: Path, **settings: Any) -> NDArray[np.float32]:
     return prepare_capture(
-        open_capture(folder, radiometry=RadiometricCalibration(**settings))
+        open_capture(folder, CaptureOptions(radiometry=RadiometricCalibration(**settings)))
     ).observations
 
 
@@ -74,7 +74,7 @@ def test_ambient_light_is_taken_off(tmp_path, light, gamma, found):
     path = write((folder if found else tmp_path) / "Ambient.png", encode(ambient))
     settings = {} if found else {"ambient": path}
     capture = prepare_capture(
-        open_capture(folder, radiometry=RadiometricCalibration(gamma, **settings))
+        open_capture(folder, CaptureOptions(radiometry=RadiometricCalibration(gamma, **settings)))
     )
     np.testing.assert_allclose(capture.observations, expected(light), atol=6e-5)
     assert ("ambient_subtracted" in codes(capture.warnings)) == found
@@ -104,7 +104,10 @@ def test_some_pixels_are_as_among_all(tmp_path: Path, light: NDArray[np.float64]
     )
     for flat_field in (flats, flats[:1]):
         source = open_capture(
-            folder, radiometry=RadiometricCalibration(ambient=ambient, flat_field=flat_field)
+            folder,
+            CaptureOptions(
+                radiometry=RadiometricCalibration(ambient=ambient, flat_field=flat_field)
+            ),
         )
         every = list(
             source.read_pixels(np.ones((9, 11), np.bool_), range(4), lambda pixels: pixels)
@@ -151,7 +154,7 @@ def test_images_that_say_they_are_for_a_screen(tmp_path: Path, light: NDArray[np
     assert "display_encoded" not in codes(read_capture(folder).warnings)
     (folder / "2.png").write_bytes(with_chunk((folder / "2.png").read_bytes(), b"sRGB", b"\0"))
     assert "display_encoded" in codes(read_capture(folder).warnings)
-    srgb_source = open_capture(folder, radiometry=RadiometricCalibration(None))
+    srgb_source = open_capture(folder, CaptureOptions(radiometry=RadiometricCalibration(None)))
     assert "display_encoded" not in codes(srgb_source.warnings)
     mixed = observed(folder)
     for image in folder.glob("*.png"):

@@ -11,6 +11,7 @@ import pytest
 from capture.conftest import WriteImage
 from scenes import write_capture
 from splinecli.capture import (
+    CaptureOptions,
     Overrides,
     RadiometricCalibration,
     find_capture_files,
@@ -214,7 +215,7 @@ def folder(tmp_path: Path, write_image: WriteImage) -> Path:
 
 def stamp(folder: Path) -> str:
     flat = RadiometricCalibration(flat_field=(folder.parent / "flat.png",))
-    return digest(open_capture(folder, radiometry=flat).stamp)
+    return digest(open_capture(folder, CaptureOptions(radiometry=flat)).stamp)
 
 
 @pytest.mark.parametrize("name", ["1.png", "../flat.png"])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splinecli.capture import open_capture
+from splinecli.capture import CaptureOptions, open_capture
 from splinecli.capture.linearise import Window, parse_window
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.estimate.inference import lighting_on
@@ -37,7 +37,8 @@ def test_a_window_reads_a_part_of_the_whole(crop: str | None, scale: str | None)
     window = parse_window(crop, scale)
     whole = prepare_capture(open_capture(MEDALLION), options=RecipeOptions(as_stored=True))
     part = prepare_capture(
-        open_capture(MEDALLION, window=window), options=RecipeOptions(as_stored=True)
+        open_capture(MEDALLION, CaptureOptions(window=window)),
+        options=RecipeOptions(as_stored=True),
     )
     np.testing.assert_array_equal(part.mask, window.of(whole.mask))
     np.testing.assert_array_equal(part.ground_truth, window.of(whole.ground_truth))
@@ -117,9 +118,11 @@ def test_values_that_mean_nothing_are_refused(
 
 def test_windows_that_do_not_fit_are_refused() -> None:
     with pytest.raises(InputError, match="--crop 0,0,5000,5 is not inside the image of"):
-        open_capture(MEDALLION, window=parse_window("0,0,5000,5", None))
+        open_capture(MEDALLION, CaptureOptions(window=parse_window("0,0,5000,5", None)))
     with pytest.raises(InputError, match="no pixel in the part that is read"):
-        prepare_capture(open_capture(MEDALLION, window=parse_window("0,0,3,3", None)))
+        prepare_capture(
+            open_capture(MEDALLION, CaptureOptions(window=parse_window("0,0,3,3", None)))
+        )
 
 
 @pytest.mark.parametrize(("crop", "scale"), WINDOWS)

@@ -14,11 +14,11 @@ import pytest
 
 from cli.conftest import read_report
 from scenes import read_json
-from splinecli.estimate.networks.weights import save_weights
 from splinecli.pipeline.batch import infer_batch
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.system.files import UNFINISHED
 from splinecli.system.publishing import UNDONE
+from splinecli.workshop.save_weights import save_weights
 from tiny_networks import random_network
 
 

@@ -116,11 +116,7 @@ def test_light_noise_costs_least_squares_its_exactness(write_dome: WriteDome) ->
         for sigma in (0, 1, 4)
     ]
     # all lights, other noise in each trial
-    assert [result.trials for result in errors] == [
-        1,
-        20,
-        20,
-    ]
+    assert [result.trials for result in errors] == [1, 20, 20]
     assert len(set(errors[1].maes_deg)) == 20
     assert errors[0].mae_deg < 0.02 < 0.2 < errors[1].mae_deg
     # The trials' noise is the same but for its size, and small errors grow in proportion.

@@ -223,7 +223,7 @@ def weights(folder: Path) -> None:
 
     from splinecli.estimate.networks.config import NetworkConfig
     from splinecli.estimate.networks.spline_net import SplineNet
-    from splinecli.estimate.networks.weights import save_weights
+    from splinecli.workshop.save_weights import save_weights
 
     torch.manual_seed(0)
     config = NetworkConfig(

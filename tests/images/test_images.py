@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scenes import Floats, shade, sphere_cap, spiral_lights, to_uint16, with_chunk, write_capture
 from splinecli.capture.formats.images import decode_image, to_linear
-from splinecli.capture.reader import open_capture
+from splinecli.capture.reader import CaptureOptions, open_capture
 from splinecli.errors import InputError
 from splinecli.images.saturation import (
     Saturation,
@@ -171,7 +171,7 @@ def test_a_given_level_is_used_as_it_is():
 
 
 def ls_error_deg(folder: Path, normals: Floats, **settings: float) -> float:
-    capture = prepare_capture(open_capture(folder, **settings))
+    capture = prepare_capture(open_capture(folder, CaptureOptions(**settings)))
     solution = np.linalg.lstsq(LIGHTS, capture.observations.T.astype(np.float64), rcond=None)[0]
     return float(angle_between_deg(unit(solution.T), normals.reshape(-1, 3)).mean())
 

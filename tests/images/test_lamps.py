@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scenes import shade, sphere, sphere_cap, spiral_lights, write_capture
 from splinecli.capture.arrays import open_arrays
 from splinecli.capture.near_lamps import NearLamps
-from splinecli.capture.reader import open_capture
+from splinecli.capture.reader import CaptureOptions, open_capture
 from splinecli.images.lamps import estimate_light_intensities
 from splinecli.lights.draws import draw_lights
 from splinecli.maths.normals import angle_between_deg, unit
@@ -61,7 +61,7 @@ def test_colours_are_divided_out(tmp_path) -> None:
     capture = prepare_capture(source)
     for untouched in (
         prepare_capture(source, options=RecipeOptions(as_stored=True)),
-        prepare_capture(open_capture(folder, intensities="equal")),
+        prepare_capture(open_capture(folder, CaptureOptions(intensities="equal"))),
     ):
         assert untouched.estimated_colours is None
         assert "estimated_colours" not in [warning.code for warning in untouched.warnings]
@@ -243,7 +243,10 @@ def test_a_capture_without_a_file_of_intensities(tmp_path):
     assert prepare_capture(open_capture(tmp_path)).estimated_intensities is None
     (tmp_path / "light_intensities.txt").unlink()
     assert (
-        prepare_capture(open_capture(tmp_path, intensities="equal")).estimated_intensities is None
+        prepare_capture(
+            open_capture(tmp_path, CaptureOptions(intensities="equal"))
+        ).estimated_intensities
+        is None
     )
 
 

@@ -274,7 +274,7 @@ def draw_cells(
     png = observation_map_figure(
         sparse,
         np.zeros_like(sparse) if with_dense else None,
-        np.full_like(sparse, np.nan) if with_truth else None,
+        {"true map, all lights": np.full_like(sparse, np.nan)} if with_truth else {},
         pixels=np.array([[12, 34]] * n_pixels) if named else None,
         error_deg=np.full(n_pixels, 3.25),
         title="$cat$, 10 lights" if named else "",

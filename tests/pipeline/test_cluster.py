@@ -29,7 +29,7 @@ from splinecli.pipeline.batch import (
     infer_batch,
     list_captures,
 )
-from splinecli.pipeline.distribution import Distributor, Item, LostError, Work, distributor
+from splinecli.pipeline.distribution import Distributor, LostError, Work, WorkItem, distributor
 from splinecli.pipeline.infer_options import ClusterOptions, InferOptions
 from splinecli.system.progress import SILENT
 
@@ -65,13 +65,13 @@ def work(tmp_path: Path) -> Callable[..., Work]:
     return make
 
 
-def run(client: Any, work: Work, items: list[Item], **options: Any) -> dict[int, Any]:
+def run(client: Any, work: Work, items: list[WorkItem], **options: Any) -> dict[int, Any]:
     distributor = Distributor(client, work, ClusterOptions(**options), SILENT)
     return {item.args[0]: result for item, result in distributor.run(items)}
 
 
-def numbered(numbers: range, memory: float = 0) -> list[Item]:
-    return [Item((number,), f"task{number}", memory) for number in numbers]
+def numbered(numbers: range, memory: float = 0) -> list[WorkItem]:
+    return [WorkItem((number,), f"task{number}", memory) for number in numbers]
 
 
 def test_an_item_that_kills_its_workers(client, work, tmp_path):
@@ -107,7 +107,9 @@ def test_a_task_for_no_worker(client, work):
     client.run(worker_tasks.set_resources, MEMORY=4 * GB)
     try:
         results = run(
-            client, work(worker_tasks.double), [*numbered(range(2), GB), Item((2,), "big", 5 * GB)]
+            client,
+            work(worker_tasks.double),
+            [*numbered(range(2), GB), WorkItem((2,), "big", 5 * GB)],
         )
     finally:
         client.run(worker_tasks.set_resources, MEMORY=1000 * GB)

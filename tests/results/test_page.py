@@ -29,7 +29,7 @@ from splinecli.maths.transfer import decode_transfer, encode_srgb
 from splinecli.pictures.maps import albedo_picture
 from splinecli.records.output_files import NORMALS
 from splinecli.results import pages as page_module
-from splinecli.results.pages import Entry, Row, index_page, result_page
+from splinecli.results.pages import IndexEntry, IndexRow, index_page, result_page
 
 HOSTILE = (
     '</script><script>document.title = "x"</script>'
@@ -379,7 +379,7 @@ def test_the_index_shows_small_pictures(open_page, tmp_path):
     }
     failed = {"capture": "x" * 200, "error": "y" * 200}
     html = index_page(
-        [Entry.of(part) for part in (report, {**report, "capture": "cut"}, failed)], tmp_path
+        [IndexEntry.of(part) for part in (report, {**report, "capture": "cut"}, failed)], tmp_path
     )
     (tmp_path / "a & b/normals.png").unlink()
     page = open_page(html, width=400)
@@ -414,7 +414,7 @@ def test_the_report_fits_a_narrow_screen(open_page):
 def test_pictures_of_earlier_results_that_are_none_of_ours_are_not_shown(tmp_path):
     folder = tmp_path / "other"
     folder.mkdir()
-    entry = Entry(Row("other"), (NORMALS["png"],))
+    entry = IndexEntry(IndexRow("other"), (NORMALS["png"],))
     picture = folder / NORMALS["png"]
     write_image(picture, np.full((9, 9, 3), 200, np.uint8))
     assert "data:image/jpeg" in index_page([entry], tmp_path)

@@ -14,7 +14,7 @@ from splinecli.errors import UsageError
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.pixel_grid import Blocks
 from splinecli.surface import mesh as mesh_module
-from splinecli.surface.mesh import SurfaceMesh, decimated_mesh, surface_mesh
+from splinecli.surface.mesh import SurfaceMesh, Textures, decimated_mesh, surface_mesh
 from splinecli.surface.surface_files import Surface, encode_surface
 
 CAMERA = np.array([[100.0, 0.0, 9.0], [0.0, 110.0, 7.0], [0.0, 0.0, 1.0]])
@@ -104,9 +104,10 @@ def test_attributes_of_vertices(camera):
     colours, normal_map, mask = COLOURS, np.zeros((15, 20, 3)), RAGGED
     normal_map[..., 2] = 1
     normal_map[3, 4] = (0.6, 0, 0.8)
-    mesh = surface_mesh(50 + WAVE, mask, camera, colours, normal_map=normal_map)
-    assert_array_equal(mesh.normals, normal_map[mask].astype(np.float32))
-    assert_array_equal(mesh.colours, colours[mask])
+    mesh = surface_mesh(50 + WAVE, mask, camera, normal_map=normal_map)
+    mesh = Textures(colours).put_on(mesh, mask)
+    np.testing.assert_array_equal(mesh.normals, normal_map[mask].astype(np.float32))
+    np.testing.assert_array_equal(mesh.colours, colours[mask])
     rows, columns = np.nonzero(mask)
     expected = np.stack(((columns + 0.5) / 20, (rows + 0.5) / 15), axis=1)
     assert_allclose(mesh.uvs, expected, atol=1e-6)
@@ -171,7 +172,7 @@ def dome(camera: Floats | None, odd: int = 0) -> tuple[tuple[Any, ...], Floats]:
     height = height_of_dome(columns, rows)
     normal_map = measured(columns, rows) * mask[..., None]
     depth = height if camera is None else 3 - height / 125
-    return (depth, mask, camera, np.full((*mask.shape, 3), 90, np.uint8)), normal_map
+    return (depth, mask, camera), normal_map
 
 
 @pytest.fixture(
@@ -262,7 +263,7 @@ def test_blocks_of_a_large_map_have_its_shape(camera, odd, monkeypatch):
     surface, normal_map = dome(camera, odd)
     mask = surface[1]
     mesh = decimated_mesh(*surface, n_triangles=300, normal_map=normal_map)
-    assert mesh.texture.shape == mesh.normal_texture.shape == (*mask.shape, 3)
+    assert mesh.normal_texture.shape == (*mask.shape, 3)
     columns, rows = (mesh.uvs * mask.shape[::-1] - 0.5).T
     found = mesh.vertices[:, 2] if camera is None else 125 * (3 + mesh.vertices[:, 2])
     near = np.hypot(columns - 44.5, rows - 44.5) < 38

@@ -14,7 +14,7 @@ from PIL import Image
 from glb_file import read_glb
 from splinecli.errors import InputError
 from splinecli.maths.transfer import decode_transfer
-from splinecli.surface.mesh import SurfaceMesh, surface_mesh
+from splinecli.surface.mesh import SurfaceMesh, Textures, surface_mesh
 from splinecli.surface.surface_files import GRAY, Surface, encode_surface
 
 SHAPE = (15, 20)
@@ -24,7 +24,7 @@ COLOURS = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3), np.uint8)
 
 def wave(coloured: bool = True, mask: NDArray[np.bool_] | None = None) -> SurfaceMesh:
     mask = np.ones(SHAPE, bool) if mask is None else mask
-    return surface_mesh(DEPTH, mask, colours=COLOURS if coloured else None)
+    return Textures(COLOURS if coloured else None).put_on(surface_mesh(DEPTH, mask), mask)
 
 
 def encode(

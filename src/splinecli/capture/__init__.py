@@ -6,13 +6,14 @@ from splinecli.capture.formats.normal_files import read_normal_map
 from splinecli.capture.layouts import capture_name, find_capture_files, find_captures
 from splinecli.capture.light_files import read_light_directions, read_light_intensities
 from splinecli.capture.linearise import RadiometricCalibration
-from splinecli.capture.reader import open_capture
+from splinecli.capture.reader import CaptureOptions, open_capture
 from splinecli.capture.record import Capture
 from splinecli.capture.source import CaptureSource
 from splinecli.records.capture_warnings import CaptureWarning
 
 __all__ = [
     "Capture",
+    "CaptureOptions",
     "CaptureSource",
     "CaptureWarning",
     "Overrides",

@@ -41,11 +41,12 @@ class ChannelLights:
         Raises InputError for a gray image.
         """
         if linear.shape[1] != CHANNELS:
-            problem = (
+            raise InputError(
                 "the image is gray, but --lights-in-channels reads a light from each of three"
-                " channels"
+                " channels",
+                path,
+                hint="Leave --lights-in-channels out",
             )
-            raise InputError(problem, path=path, hint="Leave --lights-in-channels out")
         channel = index % CHANNELS
         matrix = self.crosstalk[index // CHANNELS % len(self.crosstalk)]
         unmixed = linear @ np.linalg.inv(matrix)[channel].astype(np.float32)
@@ -53,17 +54,15 @@ class ChannelLights:
 
     def in_words(self) -> str:
         text = (
-            "The channels R, G, B of each image are read as photographs under three"
-            " lamps. This is only valid for"
+            "The channels R, G, B of each image are read as photographs under three lamps."
+            " This is only valid for gray objects; coloured objects get wrong normals."
         )
-        text += " gray objects; coloured objects get wrong normals."
-        if not self.measured:
-            text += (
-                f" Without {CROSSTALK}, each channel is assumed to respond to its own lamp only;"
-                " measure the"
-            )
-            text += " crosstalk with calibrate --gray-ball DIR --lights-in-channels."
-        return text
+        if self.measured:
+            return text
+        return (
+            f"{text} Without {CROSSTALK}, each channel is assumed to respond to its own lamp only;"
+            " measure the crosstalk with calibrate --gray-ball DIR --lights-in-channels."
+        )
 
 
 def check_crosstalk(matrix: Float64Array, path: Path) -> None:
@@ -71,17 +70,17 @@ def check_crosstalk(matrix: Float64Array, path: Path) -> None:
     if (matrix < 0).any():
         raise InputError(
             f"found the negative response {matrix.min():g}, expected numbers of at least 0",
-            path=path,
+            path,
         )
     condition = np.linalg.cond(matrix) if np.isfinite(matrix).all() else np.inf
     if condition > LARGEST_CONDITION:
         number = f"the condition number {condition:.0f}" if condition < 1e6 else "no inverse"
-        problem = f"the channels do not separate the lamps: the crosstalk matrix has {number}"
-        hint = (
-            f"Expected a condition number of at most {LARGEST_CONDITION:.0f}: use lamps with more"
-            " distinct colours"
+        raise InputError(
+            f"the channels do not separate the lamps: the crosstalk matrix has {number}",
+            path,
+            hint=f"Expected a condition number of at most {LARGEST_CONDITION:.0f}:"
+            " use lamps with more distinct colours",
         )
-        raise InputError(problem, path=path, hint=hint)
 
 
 def channel_lights(path: Path | None, n_images: int) -> ChannelLights:
@@ -93,13 +92,15 @@ def channel_lights(path: Path | None, n_images: int) -> ChannelLights:
     if path is None:
         return ChannelLights(np.eye(CHANNELS)[None], measured=False)
     matrix = read_number_rows(path).as_array()
-    if matrix.shape not in ((CHANNELS, CHANNELS), (CHANNELS * n_images, CHANNELS)):
-        problem = (
-            f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3, or 3 lines for"
-            " each image"
-        )
+    if matrix.shape not in (
+        (CHANNELS, CHANNELS),
+        (CHANNELS * n_images, CHANNELS),
+    ):
         raise InputError(
-            problem, path=path, hint="Line c, column l: the response of channel c to lamp l, R G B"
+            f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3,"
+            " or 3 lines for each image",
+            path,
+            hint="Line c, column l: the response of channel c to lamp l, R G B",
         )
     matrices = matrix.reshape(-1, CHANNELS, CHANNELS)
     for each in matrices:

@@ -34,18 +34,32 @@ from splinecli.system.files import (
 _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
 _JPEG = (".jpg", ".jpeg")
 # treated as images only in a folder without others
-_RARE = (
-    ".pgm",
-    ".ppm",
-    ".webp",
-    ".avif",
-    ".heic",
-    ".heif",
-)
+_RARE = (".pgm", ".ppm", ".webp", ".avif", ".heic", ".heif")
 PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)  # suffixes of pictures, such as masks
 _KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # kinds of files of one photograph, best first
 # suffixes of images of an object
 IMAGE_SUFFIXES = tuple(suffix for suffixes in _KINDS for suffix in suffixes)
+
+FILENAMES = "filenames.txt"
+LIGHT_POSITIONS = ("light_positions.txt",)
+MASK = tuple(f"mask{suffix}" for suffix in PICTURE_SUFFIXES)
+AMBIENT = tuple(f"ambient{suffix}" for suffix in IMAGE_SUFFIXES)
+GROUND_TRUTH = tuple(
+    f"{stem}{suffix}"
+    for suffix in (".mat", ".npy", ".png", ".tif", ".tiff", ".txt", ".bmp")
+    for stem in ("normal_gt", "normals_gt", "gt_normal", "gt_normals")
+)
+
+# Names of subfolders with the images of a capture, whose other files are in the parent; the first
+# is PSBox's.
+IMAGE_FOLDERS = ("Objects", "objects", "images", "Images")
+NOT_PHOTOGRAPHS = frozenset(
+    Path(name).stem
+    for name in (*MASK, *AMBIENT, *GROUND_TRUTH, *own_files(), *FOUND_LIGHTS, *PLOTS)
+    if Path(name).suffix in IMAGE_SUFFIXES
+)
+"""Lower-case stems of pictures in a capture's folder that are not images of the object under one
+light. The folder of results may be the same."""
 
 
 class NoImagesError(InputError):
@@ -67,17 +81,19 @@ def list_folder(folder: Path) -> list[Path]:
     """
     mode = find_mode(folder)
     if mode is None:
-        raise InputError("the folder does not exist", path=folder)
+        raise InputError("the folder does not exist", folder)
     if not stat.S_ISDIR(mode):
-        raise InputError("found a file, expected a folder of images", path=folder)
+        raise InputError("found a file, expected a folder of images", folder)
     with reading(folder, "folder"):
-        return sorted(
-            (entry for entry in folder.iterdir() if not entry.name.startswith(".")), key=natural_key
-        )
+        entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
+        return sorted(entries, key=natural_key)
 
 
 def list_images(
-    folder: Path, *, leave_out_stems: Collection[str], leave_out: Collection[Path] = ()
+    folder: Path,
+    *,
+    leave_out_stems: Collection[str] = NOT_PHOTOGRAPHS,
+    leave_out: Collection[Path] = (),
 ) -> tuple[Path, ...]:
     """Return the images of the folder in natural order, by their suffixes.
 
@@ -126,8 +142,8 @@ def copies(images: Sequence[Path]) -> list[CaptureWarning]:
         ", ".join(sorted({path.suffix.lower() for path in paths})) for paths in (others, images)
     )
     text = (
-        f"{len(others)} files ({kinds}) have the names of other images ({used}): they show the"
-        " same photographs, and"
+        f"{len(others)} files ({kinds}) have the names of other images ({used}):"
+        " they show the same photographs, and"
     )
     return [CaptureWarning(IMAGES_LEFT_OUT, f"{text} were left out.")]
 
@@ -141,11 +157,12 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
         found = ", ".join(
             f"{count} {suffix} files" for suffix, count in suffixes.most_common(3) if count > 2
         )
-        problem = "the folder contains no images" + (f", but {found}" if found else "")
-        hint = (
-            "PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files are read as images"
+        raise NoImagesError(
+            "the folder contains no images" + (f", but {found}" if found else ""),
+            folder,
+            hint="PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files"
+            " are read as images",
         )
-        raise NoImagesError(problem, path=folder, hint=hint)
 
 
 def read_image_list(path: Path) -> tuple[Path, ...]:
@@ -163,26 +180,33 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
         # Path.exists raises for a name that is too long
         image = next(filter(os.path.exists, places), None)
         if Path(name).is_absolute() or ".." in Path(name).parts:
-            hint = "Copy the image into the folder, or set a link to it there, and name that"
             raise InputError(
-                f'the image "{name}" is outside of this folder', path=path, line=line, hint=hint
+                f'the image "{name}" is outside of this folder',
+                path,
+                line=line,
+                hint="Copy the image into the folder, or set a link to it there, and name that",
             )
         if image is None:
-            hint = "Correct the name or remove the line"
-            raise InputError(f'the image "{name}" does not exist', path=path, line=line, hint=hint)
+            raise InputError(
+                f'the image "{name}" does not exist',
+                path,
+                line=line,
+                hint="Correct the name or remove the line",
+            )
         check_file(image, "an image")
         if image in images:
-            raise InputError(
-                f'the image "{name}" is also on line {images[image]}', path=path, line=line
-            )
+            raise InputError(f'the image "{name}" is also on line {images[image]}', path, line=line)
         images[image] = line
     if not images:
-        raise InputError("the list names no images", path=path)
+        raise InputError("the list names no images", path)
     return tuple(images)
 
 
 def find_images(
-    folder: Path, *, leave_out_stems: Collection[str], leave_out: Collection[Path]
+    folder: Path,
+    *,
+    leave_out_stems: Collection[str] = NOT_PHOTOGRAPHS,
+    leave_out: Collection[Path],
 ) -> tuple[tuple[Path, ...], bool]:
     """Return the images of a folder, and whether filenames.txt names them; see list_images.
 
@@ -196,28 +220,6 @@ def find_images(
     if len(images) == 1 and images[0].suffix.lower() in (".tif", ".tiff"):
         images = tuple(pages(images[0]))
     return images, False
-
-
-FILENAMES = "filenames.txt"
-LIGHT_POSITIONS = ("light_positions.txt",)
-MASK = tuple(f"mask{suffix}" for suffix in PICTURE_SUFFIXES)
-AMBIENT = tuple(f"ambient{suffix}" for suffix in IMAGE_SUFFIXES)
-GROUND_TRUTH = tuple(
-    f"{stem}{suffix}"
-    for suffix in (".mat", ".npy", ".png", ".tif", ".tiff", ".txt", ".bmp")
-    for stem in ("normal_gt", "normals_gt", "gt_normal", "gt_normals")
-)
-
-# Names of subfolders with the images of a capture, whose other files are in the parent; the first
-# is PSBox's.
-IMAGE_FOLDERS = ("Objects", "objects", "images", "Images")
-NOT_PHOTOGRAPHS = frozenset(
-    Path(name).stem
-    for name in (*MASK, *AMBIENT, *GROUND_TRUTH, *own_files(), *FOUND_LIGHTS, *PLOTS)
-    if Path(name).suffix in IMAGE_SUFFIXES
-)
-"""Lower-case stems of pictures in a capture's folder that are not images of the object under one
-light. The folder of results may be the same."""
 
 
 @dataclass(frozen=True)
@@ -234,13 +236,11 @@ class CaptureFiles:
     light_intensities: Path | None = None  # F x 3 text, or None if no file gives them
     mask: Path | None = None  # an image, or None to use every pixel
     ground_truth: Path | None = None  # a normal map, or None
-    boundaries: tuple[
-        Path, ...
-    ] = ()  # used instead of a mask: images whose pixels above zero together are the object
+    # used instead of a mask: images whose pixels above zero together are the object
+    boundaries: tuple[Path, ...] = ()
     ambient: Path | None = None  # an image under none of the lights, or None
-    others: tuple[
-        Path, ...
-    ] = ()  # pictures beside the images that are not photographs, judging by their names
+    # pictures beside the images that are not photographs, judging by their names
+    others: tuple[Path, ...] = ()
     # zero-based places in the light file of the images; None for all
     kept: tuple[int, ...] | None = None
     warnings: tuple[CaptureWarning, ...] = ()  # choices made among files with unusual names
@@ -261,11 +261,8 @@ class Overrides:
 
     def named(self) -> tuple[Path, ...]:
         """Return the files that are given. Raises InputError for a path that is not a file."""
-        files = tuple(
-            f
-            for f in (self.lights, self.intensities, self.mask, self.ground_truth)
-            if f is not None
-        )
+        given = self.lights, self.intensities, self.mask, self.ground_truth
+        files = tuple(file for file in given if file is not None)
         for file in files:
             check_file(file, "a file", pipe=file == self.lights)
         return files
@@ -275,12 +272,9 @@ def find_named(folder: Path, names: Sequence[str]) -> Path | None:
     """Return the file with the first of these names in the folder, ignoring case; None if there is
     none.
     """
-    files = {
-        entry.name.lower(): entry for entry in list_folder(folder) if entry.name.lower() in names
-    }
-    return next(
-        (files[name] for name in names if name in files and is_found_file(files[name])), None
-    )
+    entries = {entry.name.lower(): entry for entry in list_folder(folder)}
+    files = (entries[name] for name in names if name in entries)
+    return next(filter(is_found_file, files), None)
 
 
 _MASK_WORD = re.compile(r"(?<![a-z])mask(?![a-z])")
@@ -308,15 +302,10 @@ def choose_mask(
     name, of_images = folder_name(folder).lower(), images[0].parent
     entries = [*list_folder(folder), *(list_folder(of_images) if of_images != folder else ())]
     with suppress(InputError):  # we may lack permission to read the parent folder
-        around = list_folder(folder.absolute().parent)
-        entries += [
-            path for path in around if _MASK_WORD.sub("", path.stem.lower()).strip("._- ") == name
-        ]
-    named = [
-        path
-        for path in entries
-        if is_mask_name(path) and path not in images and is_found_file(path)
-    ]
+        for path in list_folder(folder.absolute().parent):
+            if _MASK_WORD.sub("", path.stem.lower()).strip("._- ") == name:
+                entries.append(path)
+    named = [p for p in entries if is_mask_name(p) and p not in images and is_found_file(p)]
     try:
         size = read_header(images[0]).size[0] if named else ()
         masks = [path for path in named if read_header(path).size[0][:2] == size[:2]]
@@ -329,13 +318,13 @@ def choose_mask(
     text = f"{masks[0].name} is used as the mask, by its name. Give --mask FILE for another one."
     if masks[0] in images:
         text = (
-            f"The alpha channel of {masks[0].name} is used as the mask. Give --mask FILE for"
-            " another one."
+            f"The alpha channel of {masks[0].name} is used as the mask."
+            " Give --mask FILE for another one."
         )
     if len(masks) > 1:
         text = (
-            f"{', '.join(path.name for path in masks)}: none is used as the mask. Choose one with"
-            " --mask FILE."
+            f"{', '.join(path.name for path in masks)}: none is used as the mask."
+            " Choose one with --mask FILE."
         )
     return masks[0] if len(masks) == 1 else None, (CaptureWarning(MASK_CHOICE, text),)
 
@@ -358,14 +347,9 @@ def stamp_files(
     slow. All other files (lights, intensities, mask, ground truth, ambient image) are stamped by
     their content. Raises InputError if a file cannot be read.
     """
-    small = (
-        files.light_directions,
-        files.light_intensities,
-        files.mask,
-        files.ground_truth,
-        files.ambient,
-    )
-    contents = [stamp_content(path) for path in (*files.boundaries, *small) if path is not None]
+    lights = files.light_directions, files.light_intensities
+    small = *files.boundaries, *lights, files.mask, files.ground_truth, files.ambient
+    contents = [stamp_content(path) for path in small if path is not None]
     return (
         [*contents, *lamps],
         [*map(_path_size_and_time, files.images)],

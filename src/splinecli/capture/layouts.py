@@ -17,7 +17,7 @@ from splinecli.capture import files
 from splinecli.capture.formats.film import is_film
 from splinecli.capture.light_files import (
     FORMATS,
-    find_lights,
+    find_light_file,
     light_names,
     light_option,
     read_light_directions,
@@ -43,18 +43,22 @@ def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFile
         return None
     if not captures:
         expected = f"{_PREFIX}specular, {_PREFIX}metallic or {_PREFIX}diffuse"
-        raise InputError(f"found no folder of images, expected {expected}", path=folder)
+        raise InputError(f"found no folder of images, expected {expected}", folder)
     images_folder, *more = captures
     if more:
         names = ", ".join(path.name for path in captures)
-        problem = f"found {len(captures)} folders of images ({names}), expected one"
-        raise InputError(problem, path=folder, hint=f"Give one of them, such as {images_folder}")
+        raise InputError(
+            f"found {len(captures)} folders of images ({names}), expected one",
+            folder,
+            hint=f"Give one of them, such as {images_folder}",
+        )
     holder = _parent(images_folder)
     lights = overrides.lights or files.find_named(holder, ["light.txt"])
     if lights is None:
-        problem = f"found no light.txt, expected the light directions of {images_folder.name}"
         raise InputError(
-            problem, path=holder, hint="Pass --lights FILE, with one line x y z for each image"
+            f"found no light.txt, expected the light directions of {images_folder.name}",
+            holder,
+            hint="Pass --lights FILE, with one line x y z for each image",
         )
     images = _list_numbered(images_folder, len(read_light_directions(lights)), lights)
     # The object is the union of both masks, so one alone would be wrong.
@@ -62,10 +66,11 @@ def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFile
         {} if overrides.mask else {name: files.find_named(holder, [name]) for name in _BOUNDARIES}
     )
     if missing := [name for name, path in masks.items() if path is None]:
-        problem = (
-            f"found no {' and no '.join(missing)}, expected the masks whose union is the object"
+        raise InputError(
+            f"found no {' and no '.join(missing)}, expected the masks whose union is the object",
+            holder,
+            hint="Pass --mask FILE",
         )
-        raise InputError(problem, path=holder, hint="Pass --mask FILE")
     return files.CaptureFiles(
         "CyclesPS",
         _name(images_folder),
@@ -92,18 +97,11 @@ def list_cyclesps(folder: Path) -> list[Path] | None:
         return None  # a light file of its own makes it a plain folder
     if is_images_folder:
         return [folder]
-    captures = [
-        entry
-        for entry in files.list_folder(folder)
-        if entry.name.startswith(_PREFIX) and is_folder(entry)
-    ]
+    captures = [path for path in _subfolders(folder) if path.name.startswith(_PREFIX)]
     # Images beside light.txt are a plain folder, to be used with --lights light.txt.
     no_photographs = files.NOT_PHOTOGRAPHS | {Path(name).stem for name in _BOUNDARIES}
-    return (
-        None
-        if not captures and files.list_images(folder, leave_out_stems=no_photographs)
-        else captures
-    )
+    is_plain = not captures and files.list_images(folder, leave_out_stems=no_photographs)
+    return None if is_plain else captures
 
 
 def _name(images_folder: Path) -> str:
@@ -132,10 +130,10 @@ def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...
     expected = f"{n_lights} ({wanted[0]} to {wanted[-1]}), one for each light in {lights.name}"
     for name in wanted:
         if name not in there:
-            raise InputError(f"the image does not exist, expected {expected}", path=folder / name)
+            raise InputError(f"the image does not exist, expected {expected}", folder / name)
     n_images = sum(bool(re.fullmatch(r"\d{5}\.tif", name)) for name in there)
     if n_images != n_lights:
-        raise InputError(f"found {n_images} images, expected {expected}", path=folder)
+        raise InputError(f"found {n_images} images, expected {expected}", folder)
     return tuple(there[name] for name in wanted)
 
 
@@ -172,8 +170,11 @@ def find_capture_files(
         captures = [capture for path in _subfolders(folder) for capture in _captures_below(path)]
         if error.path != folder or not captures:
             raise
-        hint = f"There are captures in {folder}, such as {captures[0]}: give these"
-        raise InputError(error.problem, path=folder, hint=hint) from None
+        raise InputError(
+            error.problem,
+            folder,
+            hint=f"There are captures in {folder}, such as {captures[0]}: give these",
+        ) from None
 
 
 def capture_name(folder: StrPath) -> str:
@@ -193,22 +194,17 @@ def _own_name(folder: Path) -> str:
     """Return the name of a folder, or its parent's name if the folder is called `images`. Raises
     InputError.
     """
-    name = files.folder_name(folder)
-    return (
-        files.folder_name(_parent(folder))
-        if name in files.IMAGE_FOLDERS and _parent(folder) != folder
-        else name
-    )
+    name, parent = files.folder_name(folder), _parent(folder)
+    inside = name in files.IMAGE_FOLDERS and parent != folder
+    return files.folder_name(parent) if inside else name
 
 
 def _images_folder(folder: Path) -> Path | None:
     """Return the folder of images of a capture without images of its own; None for none."""
     inside = next((path for name in files.IMAGE_FOLDERS if is_folder(path := folder / name)), None)
-    if inside is None or not all(
-        map(_is_other, files.list_images(folder, leave_out_stems=files.NOT_PHOTOGRAPHS))
-    ):
+    if inside is None or not all(map(_is_other, files.list_images(folder))):
         return None
-    return inside if files.list_images(inside, leave_out_stems=files.NOT_PHOTOGRAPHS) else None
+    return inside if files.list_images(inside) else None
 
 
 def find_captures(folder: StrPath) -> list[Path]:
@@ -230,9 +226,11 @@ def find_captures(folder: StrPath) -> list[Path]:
     if captures:
         return captures
     deeper = [path for path in inside if any(_captures_below(sub) for sub in _subfolders(path))]
-    problem = f"found no capture, expected folders of images with a light file ({light_names()})"
-    hint = f"There are captures in {deeper[0]}: give that folder" if deeper else None
-    raise InputError(problem, path=folder, hint=hint)
+    raise InputError(
+        f"found no capture, expected folders of images with a light file ({light_names()})",
+        folder,
+        hint=f"There are captures in {deeper[0]}: give that folder" if deeper else None,
+    )
 
 
 def _subfolders(folder: Path) -> list[Path]:
@@ -241,14 +239,12 @@ def _subfolders(folder: Path) -> list[Path]:
 
 def _captures_in(folder: Path) -> list[Path]:
     """Return the folder if it is a capture, or the captures of a CyclesPS object."""
-    if find_lights(folder) is not None:
+    if find_light_file(folder) is not None:
         objects = folder / files.IMAGE_FOLDERS[0]
         is_psbox = is_folder(objects) and files.find_named(folder, _PSBOX_LIGHTS) is not None
         if (
             files.find_named(folder, [files.FILENAMES]) is not None
-            or files.list_images(
-                objects if is_psbox else folder, leave_out_stems=files.NOT_PHOTOGRAPHS
-            )
+            or files.list_images(objects if is_psbox else folder)
             or _images_folder(folder) is not None
         ):
             return [folder]
@@ -275,26 +271,26 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
     """
     listed = files.find_named(folder, [files.FILENAMES]) is not None
     of_images = folder if listed else _images_folder(folder) or folder
-    images, _ = files.find_images(
-        of_images, leave_out_stems=files.NOT_PHOTOGRAPHS, leave_out=overrides.named()
-    )
+    images, _ = files.find_images(of_images, leave_out=overrides.named())
     # Without a light file, nothing gives the number of photographs.
     words = _OTHER_WORDS if overrides.needs_lights else _OTHER_WORDS | {"demo", "result", "results"}
     others = tuple(image for image in images if _is_other(image, words))
     if listed or len(others) > 0.25 * len(images):  # so many are photographs
         others = ()
     images = tuple(image for image in images if image not in others)
-    lights = overrides.lights or (find_lights(folder) if overrides.needs_lights else None)
+    lights = overrides.lights or (find_light_file(folder) if overrides.needs_lights else None)
     if lights is None and overrides.needs_lights:
         option = light_option([folder, _parent(folder)], len(images))
         hint = (
-            "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes"
-            " the file from images"
-            " of a mirror ball. Without one, --lights estimate finds them from the images, with"
-            " lower accuracy"
+            "Pass --lights FILE, with one line x y z for each image."
+            " 'splinecli calibrate' makes the file from images of a mirror ball. Without one,"
+            " --lights estimate finds them from the images, with lower accuracy"
         )
-        problem = f"the folder contains {len(images)} images but no light file ({light_names()})"
-        raise InputError(problem, path=folder, hint=f"Add {option}" if option else hint)
+        raise InputError(
+            f"the folder contains {len(images)} images but no light file ({light_names()})",
+            folder,
+            hint=f"Add {option}" if option else hint,
+        )
     layout, ground_truth = "plain folder", files.GROUND_TRUTH
     if listed and files.find_named(folder, ["light_directions.txt"]) is not None:
         # normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
@@ -311,9 +307,7 @@ def _find_psbox(folder: Path, overrides: files.Overrides) -> files.CaptureFiles 
     objects = folder / files.IMAGE_FOLDERS[0]
     if lights is None or not is_folder(objects):
         return None
-    images = files.list_images(
-        objects, leave_out_stems=files.NOT_PHOTOGRAPHS, leave_out=overrides.named()
-    )
+    images = files.list_images(objects, leave_out=overrides.named())
     files.check_not_empty(images, objects)
     return _gather("PSBox", folder, images, lights, overrides)
 
@@ -331,10 +325,8 @@ def _gather(
 
     Files named by the user take precedence over files in the folder.
     """
-    mask, warnings = (
-        overrides.mask or files.find_named(folder, files.MASK),
-        tuple[CaptureWarning, ...](),
-    )
+    mask = overrides.mask or files.find_named(folder, files.MASK)
+    warnings: tuple[CaptureWarning, ...] = ()
     if mask is None:
         mask, warnings = files.choose_mask(folder, images)
         others = tuple(path for path in others if not warnings or not files.is_mask_name(path))

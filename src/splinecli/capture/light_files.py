@@ -45,14 +45,6 @@ def _read_text(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     )
 
 
-def _encode_text(directions: Float64Array, images: Sequence[Path]) -> bytes:
-    return rows_text(directions).encode()
-
-
-def _encode_csv(directions: Float64Array, images: Sequence[Path]) -> bytes:
-    return ("x,y,z\n" + rows_text(directions).replace(" ", ",")).encode()
-
-
 def _encode_lp(directions: Float64Array, images: Sequence[Path]) -> bytes:
     rows = zip(images, rows_text(directions).splitlines(), strict=True)
     text = f"{len(images)}\n" + "".join(f"{image.name} {row}\n" for image, row in rows)
@@ -83,7 +75,11 @@ class LightFormat:
 
 FORMATS = (
     LightFormat(
-        "text", (), _read_text, ("light_directions.txt", "lights.txt"), encode=_encode_text
+        "text",
+        (),
+        _read_text,
+        ("light_directions.txt", "lights.txt"),
+        encode=lambda directions, _: rows_text(directions).encode(),
     ),
     LightFormat(
         "NumPy",
@@ -93,11 +89,16 @@ FORMATS = (
         encode=_encode_npy,
     ),
     LightFormat("RTI", (".lp",), readers.read_lp, ("*.lp",), 1, encode=_encode_lp),
-    LightFormat("Relight", (".dome", ".json"), readers.read_json, ("*.dome",), 2),
-    LightFormat("JSON list", (".json",), readers.read_json, ("light_directions.json",), 2),
-    LightFormat("AliceVision", (".json",), readers.read_json, ("*lights.json",), 1),
+    LightFormat("Relight", (".dome", ".json"), readers.read_json_lights, ("*.dome",), 2),
+    LightFormat("JSON list", (".json",), readers.read_json_lights, ("light_directions.json",), 2),
+    LightFormat("AliceVision", (".json",), readers.read_json_lights, ("*lights.json",), 1),
     LightFormat(
-        "CSV", (".csv",), _read_text, ("light_directions.csv", "lights.csv"), 2, encode=_encode_csv
+        "CSV",
+        (".csv",),
+        _read_text,
+        ("light_directions.csv", "lights.csv"),
+        2,
+        encode=lambda directions, _: f"x,y,z\n{rows_text(directions)}".replace(" ", ",").encode(),
     ),
     LightFormat(
         "MATLAB", (".mat",), readers.read_matrix, ("light_directions.mat", "lights.mat"), 2
@@ -125,27 +126,25 @@ def light_names() -> str:
 
 def light_suffixes() -> str:
     """Return the suffixes of light files, for help."""
-    return ", ".join(
-        dict.fromkeys(("text", *(suffix for each in FORMATS for suffix in each.suffixes)))
-    )
+    suffixes = (suffix for each in FORMATS for suffix in each.suffixes)
+    return ", ".join(dict.fromkeys(("text", *suffixes)))
 
 
-def find_lights(folder: Path) -> Path | None:
+def find_light_file(folder: Path) -> Path | None:
     """Return the light file in the folder; None for none. Raises InputError for several where none
     is the usual one.
     """
     entries = list_folder(folder)
     for rank in sorted({each.rank for each in FORMATS}):
         names = [name for each in FORMATS if each.rank == rank for name in each.found]
-        paths = [
-            e
-            for name in names
-            for e in entries
-            if fnmatchcase(e.name.lower(), name) and is_found_file(e)
-        ]
+        matches = (e for name in names for e in entries if fnmatchcase(e.name.lower(), name))
+        paths = list(filter(is_found_file, matches))
         if rank and len(paths) > 1:
-            problem = f"found {len(paths)} light files: {', '.join(path.name for path in paths)}"
-            raise InputError(problem, path=folder, hint="Choose one with --lights FILE")
+            raise InputError(
+                f"found {len(paths)} light files: {', '.join(path.name for path in paths)}",
+                folder,
+                hint="Choose one with --lights FILE",
+            )
         if paths:
             return paths[0]
     return find_named(folder, LIGHT_POSITIONS)
@@ -164,18 +163,15 @@ def light_option(folders: Sequence[Path], n_images: int) -> str | None:
             entries.sort(key=lambda e: "light" not in e.name.lower())
             for path in entries[:50]:
                 name = path.name.lower()
-                if (
-                    re.search("intens|camera|filenames|lobes", name)
-                    or path.stat().st_size > numbers.MOST_TEXT
-                ):
+                is_other = re.search("intens|camera|filenames|lobes", name)
+                if is_other or path.stat().st_size > numbers.MOST_TEXT:
                     continue
                 angles: RowForm = "slant-tilt" if re.search("slant|tilt", name) else "azel"
                 for form in ("xyz", angles):
                     with suppress(InputError):
                         read_lights(path, n_images, form=form)
-                        return f"--lights {path}" + (
-                            f" --light-format {form}" if form != "xyz" else ""
-                        )
+                        option = f"--lights {path}"
+                        return option if form == "xyz" else f"{option} --light-format {form}"
     return None
 
 
@@ -219,9 +215,12 @@ def read_light_positions(
     table = format_of(path).read(path, n_images, "positions")
     positions, _ = lights_of(table, n_images, frame, "positions")
     if table.names is not None:
-        problem = f"found the name {table.names[0]!r}, expected x y z"
-        hint = "Positions have a line for each image, in the order of the images"
-        raise InputError(problem, path=table.path, line=table.rows[0].line, hint=hint)
+        raise InputError(
+            f"found the name {table.names[0]!r}, expected x y z",
+            table.path,
+            line=table.rows[0].line,
+            hint="Positions have a line for each image, in the order of the images",
+        )
     return positions
 
 
@@ -251,13 +250,10 @@ def lights_of(
         vectors = light_rows.directions_from_angles(vectors, form)
     vectors = vectors @ frame.matrix.T + 0.0  # no -0
     lines = [table.rows[2 if transposed else light].line for light in range(len(vectors))]
+    place = " in column " if transposed else " as light "
     places = [
-        f" in column {light + 1}"
-        if transposed
-        else f" as light {light + 1}"
-        if lines[light] is None
-        else ""
-        for light in range(len(vectors))
+        f"{place}{light}" if transposed or line is None else ""
+        for light, line in enumerate(lines, start=1)
     ]
     lamps = form == "positions"
     return vectors, unit_directions(
@@ -290,25 +286,29 @@ def unit_directions(
     # float64's range.
     scaled = np.divide(vectors, largest, out=np.zeros_like(vectors), where=largest > 0)
     directions = unit(scaled)
-    if leave_bad and np.count_nonzero(directions[:, 2] <= 0) <= 0.1 * len(
-        directions
-    ):  # the frame is right
+    # With so few, the frame is right.
+    if leave_bad and np.count_nonzero(directions[:, 2] <= 0) <= 0.1 * len(directions):
         return directions
     for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
         if not vector.any():
-            problem = (
-                f"found a zero vector{place}, expected a"
-                f" {'lamp position' if lamps else 'light direction'}"
+            raise InputError(
+                f"found a zero vector{place},"
+                f" expected a {'lamp position' if lamps else 'light direction'}",
+                path,
+                line=line,
+                hint="Write x y z towards the light, or remove the line and its image",
             )
-            hint = "Write x y z towards the light, or remove the line and its image"
-            raise InputError(problem, path=path, line=line, hint=hint)
         if z <= 0:
             what = "lamp behind the object" if lamps else "light below the horizon"
             hint = "z points to the camera; the file may be in another frame"
             if (directions[:, 2] < 0).all():
                 hint = "z points away from the camera in this file: add --light-frame z-away"
-            problem = f"found a {what}{place} (z = {vector[2]:g}), expected z > 0"
-            raise InputError(problem, path=path, line=line, hint=hint)
+            raise InputError(
+                f"found a {what}{place} (z = {vector[2]:g}), expected z > 0",
+                path,
+                line=line,
+                hint=hint,
+            )
     return directions
 
 
@@ -326,9 +326,12 @@ def read_light_intensities(path: StrPath, n_images: int) -> Float64Array:
     for light, channel in np.argwhere(~light_rows.usable_intensities(intensities)):
         value, line = intensities[light, channel], table.rows[channel if transposed else light].line
         place = f" in column {light + 1}" if transposed else ""
-        expected = "above 0" if value <= 0 else light_rows.INTENSITIES
-        problem = f"found the intensity {value:g}{place}, expected a number {expected}"
-        raise InputError(problem, path=table.path, line=line)
+        expected = "above 0" if value <= 0 else light_rows.INTENSITY_RANGE
+        raise InputError(
+            f"found the intensity {value:g}{place}, expected a number {expected}",
+            table.path,
+            line=line,
+        )
     return np.broadcast_to(intensities, (n_images, 3)).copy()
 
 
@@ -359,11 +362,13 @@ def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
     if not count.is_integer():
         expected = numbers.columns(len(following[0].numbers))
         raise InputError(
-            f"found 1 column, expected {expected} or a count", path=table.path, line=first.line
+            f"found 1 column, expected {expected} or a count", table.path, line=first.line
         )
-    problem = f"the count line says {count:.0f}, but {len(following)} rows follow"
     raise InputError(
-        problem, path=table.path, line=first.line, hint="Correct the count or leave it out"
+        f"the count line says {count:.0f}, but {len(following)} rows follow",
+        table.path,
+        line=first.line,
+        hint="Correct the count or leave it out",
     )
 
 
@@ -386,21 +391,21 @@ def _one_light_a_row(
         decimal_commas = n_columns > 3 and (
             numbers.has_decimal_commas(text) or (n_columns == 6 and text.count(",") >= 3)
         )
-        problem = f"found {numbers.columns(n_columns)}, expected {expected}"
-        hint = numbers.DECIMAL_POINT if decimal_commas else None
-        raise InputError(problem, path=table.path, line=table.rows[0].line, hint=hint)
+        raise InputError(
+            f"found {numbers.columns(n_columns)}, expected {expected}",
+            table.path,
+            line=table.rows[0].line,
+            hint=numbers.DECIMAL_POINT if decimal_commas else None,
+        )
     for lights, transposed in readings:
         if n_images is None or len(lights) == n_images:
             return lights, transposed
     count = len(readings[0][0])
-    what = (
-        {"light directions": "light direction", "lights": "light"}.get(what, what)
-        if count == 1
-        else what
-    )
+    if count == 1 and what in ("light directions", "lights"):
+        what = what[:-1]
     problem = f"found {count} {what}, expected {n_images}, one for each image"
     hint = "The file needs one line for each image, in the order of the images"
-    error = WrongCountError(problem, path=table.path, hint=hint)
+    error = WrongCountError(problem, table.path, hint=hint)
     error.n_found = count
     raise error
 
@@ -421,9 +426,7 @@ def match_images(table: NumberRows, images: Sequence[Path]) -> tuple[tuple[Path,
     seen = set()
     for name, row in zip(names, table.rows, strict=True):
         if name.casefold() in seen:
-            raise InputError(
-                f'a second light for the image "{name}"', path=table.path, line=row.line
-            )
+            raise InputError(f'a second light for the image "{name}"', table.path, line=row.line)
         seen.add(name.casefold())
     for how, part in (("name", "name"), ("name without suffix", "stem")):
         by_key = {getattr(image, part).casefold(): image for image in reversed(images)}
@@ -435,9 +438,12 @@ def match_images(table: NumberRows, images: Sequence[Path]) -> tuple[tuple[Path,
     present = {image.name.casefold() for image in images}
     missing = next((i for i, name in enumerate(names) if name.casefold() not in present), 0)
     problem = f"found {len(names)} lights but {len(images)} images; the image"
-    hint = "Correct the names in the file, or give as many images as lights, in the same order"
-    problem = f'{problem} "{names[missing]}" is not among them'
-    raise InputError(problem, path=table.path, line=table.rows[missing].line, hint=hint)
+    raise InputError(
+        f'{problem} "{names[missing]}" is not among them',
+        table.path,
+        line=table.rows[missing].line,
+        hint="Correct the names in the file, or give as many images as lights, in the same order",
+    )
 
 
 def read_lights(
@@ -454,25 +460,23 @@ def read_lights(
     return table, lights_of(table, n_rows, frame, form, leave_bad=form != "positions")[1]
 
 
-def check_writable(path: Path) -> Callable[[Float64Array, Sequence[Path]], bytes]:
+def light_encoder(path: Path) -> Callable[[Float64Array, Sequence[Path]], bytes]:
     """Return the encoder of the format that a file's suffix names. Raises UsageError if it can only
     be read.
     """
     encode = format_of(path).encode
     if encode is None:
-        *most, last = (
-            ".txt",
-            *(each.suffixes[0] for each in FORMATS if each.encode and each.suffixes),
-        )
-        hint = f"Write {', '.join(most)} or {last}"
+        suffixes = (each.suffixes[0] for each in FORMATS if each.encode and each.suffixes)
+        *most, last = ".txt", *suffixes
         raise UsageError(
-            f"{path}: light files of the type {path.suffix.lower()} are only read", hint=hint
+            f"{path}: light files of the type {path.suffix.lower()} are only read",
+            hint=f"Write {', '.join(most)} or {last}",
         )
     return encode
 
 
 def encode_lights(path: Path, directions: Float64Array, images: Sequence[Path]) -> bytes:
     """Return a light file of directions (F, 3) of images, in the format that its suffix names; see
-    check_writable.
+    light_encoder.
     """
-    return check_writable(path)(directions, images)
+    return light_encoder(path)(directions, images)

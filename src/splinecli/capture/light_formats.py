@@ -18,8 +18,8 @@ from msgspec import Struct, ValidationError, convert, field
 from numpy.typing import NDArray
 
 from splinecli.capture.formats import numbers
-from splinecli.capture.formats.numbers import NumberRows, Row, to_number
-from splinecli.capture.light_rows import INTENSITIES, RowForm, image_name, usable_intensities
+from splinecli.capture.formats.numbers import NumberRow, NumberRows, to_number
+from splinecli.capture.light_rows import INTENSITY_RANGE, RowForm, image_name, usable_intensities
 from splinecli.errors import InputError
 from splinecli.maths import Float64Array
 from splinecli.records.base import Positive
@@ -35,57 +35,55 @@ def read_lp(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     stored = numbers.read_lines(path, else_latin_1=True)
     content = [(line, text.strip()) for line, text in enumerate(stored, start=1) if text.strip()]
     if not content:
-        raise InputError(
-            "the file is empty, expected the number of lights on the first line", path=path
-        )
+        raise InputError("the file is empty, expected the number of lights on the first line", path)
     (first, count), *rows = content
     words = count.split()
     if len(words) > 3 and None not in map(to_number, words[-3:]):
         rows = content
     elif not count.isdecimal():
-        raise InputError(
-            f'found "{count[:40]}", expected the number of lights', path=path, line=first
-        )
+        raise InputError(f'found "{count[:40]}", expected the number of lights', path, line=first)
     elif int(count[:9]) != len(rows):
-        problem = f"the first line says {count[:40]} lights, but {len(rows)} lines follow"
         raise InputError(
-            problem, path=path, line=first, hint="Correct the number, or restore the missing lines"
+            f"the first line says {count[:40]} lights, but {len(rows)} lines follow",
+            path,
+            line=first,
+            hint="Correct the number, or restore the missing lines",
         )
     if not rows:
-        raise InputError("the file contains no lights", path=path, line=first)
+        raise InputError("the file contains no lights", path, line=first)
     names, vectors = [], []
     commas = numbers.uses_decimal_commas([text for _, text in rows], 3)
     for line, text in rows:
         words = text.rsplit(maxsplit=3)
         if len(words) < 4:
             raise InputError(
-                f'found "{text[:40]}", expected a file name and x y z', path=path, line=line
+                f'found "{text[:40]}", expected a file name and x y z', path, line=line
             )
         names.append(image_name(words[0], []))
         words = numbers.split_words(" ".join(words[1:]), decimal_commas=commas)[:3]
         vectors.append(
-            Row(tuple(numbers.parse_number(word, path, line) for word in words), line, text)
+            NumberRow(tuple(numbers.parse_number(word, path, line) for word in words), line, text)
         )
     return NumberRows(path, tuple(vectors), tuple(names), are_vectors=True)
 
 
-def read_json(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
+def read_json_lights(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     """Read the lights of a JSON file: a dome of Relight, a list of x y z, or what AliceVision
     writes.
     """
     try:
         document = parse_json("\n".join(numbers.read_lines(path)))
     except json.JSONDecodeError as error:
-        raise InputError(f"is not JSON ({error.msg})", path=path, line=error.lineno) from None
+        raise InputError(f"is not JSON ({error.msg})", path, line=error.lineno) from None
     except ValueError as error:
-        raise InputError(f"cannot be read as JSON ({error})", path=path) from None
+        raise InputError(f"cannot be read as JSON ({error})", path) from None
     named = isinstance(document, dict) and not {"directions", *_DOME_POSITIONS}.isdisjoint(document)
     if named or path.suffix.lower() == ".dome":
         return _read_dome(document, path, form)
     listed = _listed(document)
     if listed is None:
         return _read_alicevision(document, path)
-    rows = tuple(Row(tuple(vector), line) for line, vector in enumerate(listed[1], start=1))
+    rows = tuple(NumberRow(tuple(vector), line) for line, vector in enumerate(listed[1], start=1))
     return NumberRows(path, rows, listed[0])
 
 
@@ -101,26 +99,30 @@ class _Light(Struct):
 def _read_alicevision(document: Any, path: Path) -> NumberRows:
     listed = document.get("lights") if isinstance(document, dict) else None
     if not isinstance(listed, list) or not listed:
-        problem = (
-            'found no list "lights", expected lights as AliceVision writes them, or a list of x y z'
+        raise InputError(
+            'found no list "lights", expected lights as AliceVision writes them,'
+            " or a list of x y z",
+            path,
         )
-        raise InputError(problem, path=path)
     names, vectors, intensities = [], [], []
     for number, values in enumerate(listed, start=1):
         try:
             light = convert(values, _Light)
         except ValidationError as error:
-            hint = "Calibrate for distant lights, with one direction for each light"
-            raise InputError(f"light {number}: {error}", path=path, hint=hint) from None
+            raise InputError(
+                f"light {number}: {error}",
+                path,
+                hint="Calibrate for distant lights, with one direction for each light",
+            ) from None
         names.append(image_name(str(number if light.view is None else light.view), []))
         x, y, z = light.direction
         vectors.append((x, -y, -z))
         intensities += [] if light.intensity is None else [light.intensity]
     if intensities and len(intensities) != len(listed):
-        problem = (
-            f"{len(intensities)} of {len(listed)} lights have an intensity, expected all or none"
+        raise InputError(
+            f"{len(intensities)} of {len(listed)} lights have an intensity, expected all or none",
+            path,
         )
-        raise InputError(problem, path=path)
     return _unnumbered(path, vectors, names, intensities)
 
 
@@ -135,7 +137,7 @@ def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
     gives intensities.
     """
     if not isinstance(document, dict):
-        raise InputError("found no object, expected a dome as Relight writes it", path=path)
+        raise InputError("found no object, expected a dome as Relight writes it", path)
     positions = _DOME_POSITIONS
     if document.get("lightConfiguration") == "spherical":
         positions = ("positionsSphere", "positions3d", "positions")
@@ -143,19 +145,17 @@ def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
     key = next((key for key in keys if document.get(key)), None)
     if key is None:
         raise InputError(
-            f"found no list of {' or '.join(keys)}, expected a dome as Relight writes it", path=path
+            f"found no list of {' or '.join(keys)}, expected a dome as Relight writes it", path
         )
-    vectors, factors = (
-        _vectors(document[key], "xyz"),
-        _vectors(document.get("ledAdjust"), "rgb") or [],
-    )
+    vectors = _vectors(document[key])
+    factors = _vectors(document.get("ledAdjust"), "rgb") or []
     if vectors is None or any(len(vector) != 3 for vector in vectors):
-        raise InputError(f'the list "{key}" does not have x, y and z for each light', path=path)
+        raise InputError(f'the list "{key}" does not have x, y and z for each light', path)
     usable = all(usable_intensities(np.array(light)).all() for light in factors)
     if factors and not (usable and len(factors) == len(vectors)):
         problem = f'the list "ledAdjust" has {len(factors)} factors for {len(vectors)} lights'
         raise InputError(
-            problem if usable else f'a factor of "ledAdjust" is not {INTENSITIES}', path=path
+            problem if usable else f'a factor of "ledAdjust" is not {INTENSITY_RANGE}', path
         )
     return _unnumbered(path, vectors, None, [[1 / factor for factor in light] for light in factors])
 
@@ -164,11 +164,7 @@ def _listed(document: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] |
     """Return the names and vectors of a list [[x, y, z], ...], or of an object with each image's
     light by its name.
     """
-    if (
-        isinstance(document, dict)
-        and len(document) == 1
-        and _vectors(*document.values()) is not None
-    ):
+    if isinstance(document, dict) and len(document) == 1 and _vectors(*document.values()):
         (document,) = document.values()
     names = tuple(image_name(name, []) for name in document) if isinstance(document, dict) else None
     vectors = _vectors(document if names is None else list(document.values()))
@@ -179,18 +175,15 @@ def _vectors(values: Any, keys: str = "xyz") -> list[list[float]] | None:
     """Return lists of two numbers or more, or objects with these keys, as lists of numbers; None
     for anything else.
     """
-    listed = values if isinstance(values, list) else []
-    vectors: list[Any] = [
-        [each.get(key) for key in keys] if isinstance(each, dict) else each for each in listed
-    ]
-    if not all(
-        isinstance(vector, list)
-        and len(vector) > 1
-        and all(type(number) in (int, float) for number in vector)
-        for vector in vectors
-    ):
-        return None
-    return [[float(number) for number in vector] for vector in vectors] or None
+    vectors = []
+    for each in values if isinstance(values, list) else []:
+        vector = [each.get(key) for key in keys] if isinstance(each, dict) else each
+        if not isinstance(vector, list) or len(vector) < 2:
+            return None
+        if any(type(number) not in (int, float) for number in vector):
+            return None
+        vectors.append([float(number) for number in vector])
+    return vectors or None
 
 
 def _unnumbered(
@@ -200,7 +193,7 @@ def _unnumbered(
     intensities: Sequence[Sequence[float]],
 ) -> NumberRows:
     """Return vectors of a file without lines."""
-    rows = tuple(Row(tuple(vector), None) for vector in vectors)
+    rows = tuple(NumberRow(tuple(vector), None) for vector in vectors)
     given = np.array(intensities, np.float64) if intensities else None
     return NumberRows(path, rows, None if names is None else tuple(names), given, are_vectors=True)
 
@@ -224,59 +217,51 @@ def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     them from 1.
     """
     suffix = path.suffix.lower()
-    numbers.check_length(path, numbers.MOST_TEXT)
+    numbers.check_text_length(path, numbers.MOST_TEXT)
     if suffix == ".npy":
         array = _read_npy(path)
     else:
-        array = _choose(
-            numbers.read_matrices(path) if suffix == ".mat" else _read_opencv(path), path, n_images
+        read = numbers.read_matrices if suffix == ".mat" else _read_opencv
+        array = _choose(read(path), path, n_images)
+    is_matrix = array.ndim == 2 and array.dtype.kind in "fiu" and array.size
+    if not is_matrix or not np.isfinite(array).all():
+        raise InputError(
+            f"found an array of shape {array.shape} and type {array.dtype},"
+            " expected finite numbers N x 3",
+            path,
         )
-    if (
-        array.ndim != 2
-        or array.dtype.kind not in "fiu"
-        or not array.size
-        or not np.isfinite(array).all()
-    ):
-        problem = (
-            f"found an array of shape {array.shape} and type {array.dtype}, expected finite"
-            " numbers N x 3"
-        )
-        raise InputError(problem, path=path)
     rows = enumerate(array.astype(np.float64).tolist(), start=1)
-    return NumberRows(path, tuple(Row(tuple(row), line) for line, row in rows))
+    return NumberRows(path, tuple(NumberRow(tuple(row), line) for line, row in rows))
 
 
 def _choose(matrices: Mapping[str, Float64Array], path: Path, n_images: int | None) -> Float64Array:
     """Return the matrix N x 3 or 3 x N, of several the one that has a light for each image."""
-    lights = {
-        name: matrix for name, matrix in matrices.items() if matrix.ndim == 2 and 3 in matrix.shape
-    }
+    lights = {name: m for name, m in matrices.items() if m.ndim == 2 and 3 in m.shape}
     if len(lights) > 1:
-        lights = {
-            name: m for name, m in lights.items() if m.shape in ((n_images, 3), (3, n_images))
-        } or lights
+        usual = (n_images, 3), (3, n_images)
+        lights = {name: m for name, m in lights.items() if m.shape in usual} or lights
     if len(lights) == 1:
         return next(iter(lights.values()))
     sizes = ", ".join(
         f"{name} ({' x '.join(map(str, m.shape))})" for name, m in (lights or matrices).items()
     )
-    problem = (
+    raise InputError(
         f"found {'several matrices' if lights else 'no matrix'} N x 3 or 3 x"
-        f" N{f': {sizes}' if sizes else ''}"
+        f" N{f': {sizes}' if sizes else ''}",
+        path,
+        hint="Write the light directions into a text file, a line x y z for each image",
     )
-    hint = "Write the light directions into a text file, a line x y z for each image"
-    raise InputError(problem, path=path, hint=hint)
 
 
 def _read_npy(path: Path) -> NDArray[np.generic]:
     try:
         with path.open("rb") as file:
-            return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+            return np.lib.format.read_array(file, allow_pickle=False)
     except OSError as error:
-        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+        raise InputError(f"the file cannot be read ({error.strerror})", path) from None
     except Exception:  # the header is a Python literal: a damaged one fails in a dozen ways
         raise InputError(
-            "the .npy file is damaged, or contains no array of numbers", path=path
+            "the .npy file is damaged, or contains no array of numbers", path
         ) from None
 
 
@@ -284,13 +269,14 @@ def _read_opencv(path: Path) -> dict[str, Float64Array]:
     """Return the matrices of a file of OpenCV's FileStorage by name. Raises InputError."""
     text = numbers.read_text(path).decode(errors="replace")
     found: dict[str, Float64Array] = {}
-    for name, rows, columns, data in (_XML if path.suffix.lower() == ".xml" else _YAML).findall(
-        text
-    ):
+    pattern = _XML if path.suffix.lower() == ".xml" else _YAML
+    for name, rows, columns, data in pattern.findall(text):
         try:
             values = np.array([float(word) for word in re.split(r"[\s,]+", data.strip())])
             found[name] = values.reshape(int(rows), int(columns))
         except ValueError:
-            problem = f"the matrix {name} is damaged: its numbers do not fill {rows} x {columns}"
-            raise InputError(problem, path=path) from None
+            raise InputError(
+                f"the matrix {name} is damaged: its numbers do not fill {rows} x {columns}",
+                path,
+            ) from None
     return found

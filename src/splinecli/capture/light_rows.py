@@ -12,8 +12,8 @@ from typing import Literal
 import numpy as np
 
 from splinecli.capture.formats.numbers import (
+    NumberRow,
     NumberRows,
-    Row,
     parse_rows,
     read_rows_of_words,
     to_number,
@@ -32,7 +32,7 @@ AXIS_WORDS = {
 """The words of --light-frame: an axis of the file, and its sign in the usual frame."""
 
 _LEAST, _MOST = 1e-12, 1e12
-INTENSITIES = f"from {_LEAST:g} to {_MOST:g}"
+INTENSITY_RANGE = f"from {_LEAST:g} to {_MOST:g}"
 """The range of light intensities. Such numbers and their inverses are within the range of float32.
 """
 
@@ -44,11 +44,7 @@ class LightFrame:
     """The frame of a light file."""
 
     # of x, y and z, 1 for right, up and to the camera, -1 for left, down, away
-    signs: tuple[int, int, int] = (
-        1,
-        1,
-        1,
-    )
+    signs: tuple[int, int, int] = (1, 1, 1)
     # whether the file has y before x. The signs belong to x and y in either order
     exchanged: bool = False
 
@@ -58,26 +54,21 @@ class LightFrame:
         camera.
         """
         order = [1, 0, 2] if self.exchanged else [0, 1, 2]
-        return np.asarray(np.diag(self.signs).astype(np.float64)[:, order])
+        return np.diag(self.signs).astype(np.float64)[:, order]
 
     def __str__(self) -> str:
         """Return the value of --light-frame, such as "x-left,y-down". Axes with their usual
         direction are left out.
         """
         words = [EXCHANGED] if self.exchanged else []
-        words += [
-            name for name, (axis, sign) in AXIS_WORDS.items() if sign == self.signs[axis] == -1
-        ]
+        words += [word for word, (axis, sign) in AXIS_WORDS.items() if sign == self.signs[axis] < 0]
         return ",".join(words) or "x-right,y-up"
 
     def describe(self) -> str:
         """Return words such as "x and y exchanged, y negated"; empty for the usual frame."""
-        negated = " and ".join(
-            axis for axis, sign in zip("xyz", self.signs, strict=True) if sign < 0
-        )
         parts = ["x and y exchanged"] if self.exchanged else []
-        if negated:
-            parts.append(f"{negated} negated")
+        if negated := [axis for axis, sign in zip("xyz", self.signs, strict=True) if sign < 0]:
+            parts.append(f"{' and '.join(negated)} negated")
         return ", ".join(parts)
 
     def after(self, first: LightFrame) -> LightFrame:
@@ -169,25 +160,24 @@ def check_angles(table: NumberRows, form: RowForm) -> None:
         if not (0 < elevation <= 90 and abs(azimuth) <= 360):
             if form == "slant-tilt":
                 problem = (
-                    f"found slant {first:g} and tilt {second:g}, expected 0 to below 90 and -360"
-                    " to 360 degrees"
+                    f"found slant {first:g} and tilt {second:g}, expected 0 to below 90 and -360 to"
+                    " 360 degrees"
                 )
                 hint = "The slant counts from the camera axis"
             else:
                 problem = (
-                    f"found azimuth {first:g} and elevation {second:g}, expected -360 to 360 and"
-                    " above 0 to 90"
+                    f"found azimuth {first:g} and elevation {second:g},"
+                    " expected -360 to 360 and above 0 to 90"
                 )
                 problem += " degrees"
                 hint = (
                     "The elevation counts from the image plane: 90 is the direction of the camera"
                 )
-            raise InputError(problem, path=table.path, line=row.line, hint=hint)
+            raise InputError(problem, table.path, line=row.line, hint=hint)
     if np.abs([row.numbers[-2:] for row in table.rows]).max() < 2 * np.pi:
-        problem = "no angle is above 2 pi, so they look like radians, expected degrees"
         raise InputError(
-            problem,
-            path=table.path,
+            "no angle is above 2 pi, so they look like radians, expected degrees",
+            table.path,
             line=table.rows[0].line,
             hint="Multiply them by 180 / pi = 57.2958",
         )
@@ -204,7 +194,7 @@ def lights_of_half_vectors(half_vectors: Float64Array) -> Float64Array:
     """Return the lights (..., 3) that a mirror with these unit normals reflects towards the
     camera.
     """
-    return np.asarray(2 * half_vectors[..., 2:] * half_vectors - (0.0, 0.0, 1.0))
+    return 2 * half_vectors[..., 2:] * half_vectors - (0.0, 0.0, 1.0)
 
 
 def refuse_angles(table: NumberRows) -> None:
@@ -219,12 +209,11 @@ def refuse_angles(table: NumberRows) -> None:
     found, hint = "", AZEL_HINT
     if max(abs(value) for row in rows for value in row[-2:]) > 2 and (lengths == {2} or numbered):
         found = (
-            f"{'a number and two angles' if numbered else '2 columns of angles'}, expected 3"
-            " columns (x y z)"
+            f"{'a number and two angles' if numbered else '2 columns of angles'},"
+            " expected 3 columns (x y z)"
         )
-    elif (
-        lengths == {3} and not numbered
-    ):  # perhaps with the same radius; vectors around an object have y < 0
+    elif lengths == {3} and not numbered:
+        # perhaps with the same radius; vectors around an object have y < 0
         azimuth, elevation, radius = np.array(rows).T
         in_range = (np.abs(azimuth) <= 360).all() and ((elevation > 0) & (elevation <= 90)).all()
         if np.ptp(radius) == 0 and in_range and elevation.max() > 2 and np.abs(azimuth).max() > 90:
@@ -233,17 +222,16 @@ def refuse_angles(table: NumberRows) -> None:
                 f"Leave the third column out. {hint}",
             )
     if found:
-        raise InputError(f"found {found}", path=table.path, line=table.rows[0].line, hint=hint)
+        raise InputError(f"found {found}", table.path, line=table.rows[0].line, hint=hint)
 
 
 def counts_rows(column: list[float]) -> int | None:
     """Return the first number of a column that counts the rows in some order, 0 or 1; None for any
     other column.
     """
-    ordered = sorted(column)
-    return next(
-        (first for first in (0, 1) if ordered == list(range(first, first + len(column)))), None
-    )
+    first = min(column)
+    counts = first in (0, 1) and sorted(column) == [first + place for place in range(len(column))]
+    return int(first) if counts else None
 
 
 _AXIS = re.compile(r"(?:.*[^a-z]|[lnd]|light|pos|position|dir|direction)?([xyz])")
@@ -273,9 +261,12 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
         zenith = ("zen", "polar", "incl", "colat", "coelev")
         found = next((word for word in header if word.lower().startswith(zenith)), None)
         if found is not None and n_numbers == len(_ANGLES):
-            problem = f'found the column "{found[:40]}", expected azimuth and elevation'
-            hint = "The elevation is 90 minus the angle from the camera axis"
-            raise InputError(problem, path=path, line=line, hint=hint)
+            raise InputError(
+                f'found the column "{found[:40]}", expected azimuth and elevation',
+                path,
+                line=line,
+                hint="The elevation is 90 minus the angle from the camera axis",
+            )
     # A count may precede rows with names.
     body = rows[1:] if len(rows) > 1 and len(rows[0][2]) == 1 else rows
     if body and all(to_number(words[0]) is None for *_, words in body):
@@ -287,8 +278,12 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
         if n_numbers == len(_AXES) and [len(words) for words in angles] == len(body) * [
             len(_ANGLES)
         ]:
-            problem = "found a name and 2 numbers, expected a name and 3 (x y z)"
-            raise InputError(problem, path=path, line=body[0][0], hint=AZEL_HINT)
+            raise InputError(
+                "found a name and 2 numbers, expected a name and 3 (x y z)",
+                path,
+                line=body[0][0],
+                hint=AZEL_HINT,
+            )
     return _reordered(parse_rows(rows, path), order)
 
 
@@ -311,13 +306,11 @@ def _order_of(header: list[str]) -> list[int]:
 def _reordered(table: NumberRows, order: list[int]) -> NumberRows:
     first = -len(order)
 
-    def reorder(row: Row) -> Row:
+    def reorder(row: NumberRow) -> NumberRow:
         last = row.numbers[first:]
-        return (
-            row._replace(numbers=(*row.numbers[:first], *(last[i] for i in order)))
-            if len(last) == -first
-            else row
-        )
+        if len(last) < len(order):
+            return row
+        return row._replace(numbers=(*row.numbers[:first], *(last[i] for i in order)))
 
     return replace(table, rows=tuple(map(reorder, table.rows)))
 
@@ -332,5 +325,5 @@ def image_name(text: str, numbers: list[str]) -> str:
 
 
 def usable_intensities(values: Float64Array) -> Bools:
-    """Return which values are within INTENSITIES."""
+    """Return which values are within INTENSITY_RANGE."""
     return (values >= _LEAST) & (values <= _MOST)

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from splinecli.capture.files import LIGHT_POSITIONS, find_named, stamp_content
 from splinecli.capture.formats.numbers import read_lines, read_number_rows, to_number
-from splinecli.capture.light_files import FORMATS, find_lights, format_of, read_light_positions
+from splinecli.capture.light_files import FORMATS, find_light_file, format_of, read_light_positions
 from splinecli.capture.light_rows import LightFrame, read_light_rows
 from splinecli.capture.linearise import Window
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Integers
 from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.maths.pixel_grid import ray_basis
+from splinecli.maths.pixel_grid import bounds, ray_basis
 from splinecli.records.capture_warnings import LAMP_DISTANCE, NEAR_LAMPS, CaptureWarning
 from splinecli.system.files import is_substitution
 
@@ -55,14 +55,9 @@ class NearLamps:
     lobes: Float64Array | None = None
 
     def __post_init__(self) -> None:
-        if (
-            self.positions.ndim != 2
-            or self.positions.shape[1] != 3
-            or not np.isfinite(self.positions).all()
-        ):
-            raise InputError(
-                f"lamp positions of shape {self.positions.shape}, expected finite (F, 3)"
-            )
+        shape = self.positions.shape
+        if len(shape) != 2 or shape[1] != 3 or not np.isfinite(self.positions).all():
+            raise InputError(f"lamp positions of shape {shape}, expected finite (F, 3)")
         if (self.positions[:, 2] <= 0).any():
             raise InputError("a lamp is behind the object (z <= 0)", hint="z points to the camera")
         if not 0 < self.pixel_size < np.inf:
@@ -90,9 +85,8 @@ class NearLamps:
         if equal:
             distances = np.full_like(distances, distances.mean())
         elif lobes is not None:
-            distances = distances / np.sqrt(
-                _within_lobes(lobes, positions[None] / distances[:, None])[0]
-            )
+            towards = positions[None] / distances[:, None]
+            distances = distances / np.sqrt(_within_lobes(lobes, towards)[0])
         middle = (shape[0] - 1) / 2, (shape[1] - 1) / 2
         return cls(positions, pixel_size, middle, distances, camera_matrix, lobes=lobes)
 
@@ -126,12 +120,11 @@ class NearLamps:
     def choose_lights(self, positions: Sequence[int]) -> NearLamps:
         """Return some of the lamps, in the order given."""
         chosen = list(positions)
-        lobes, distances = (
-            None if self.lobes is None else self.lobes[chosen],
-            self.reference_distances[chosen],
-        )
         return replace(
-            self, positions=self.positions[chosen], reference_distances=distances, lobes=lobes
+            self,
+            positions=self.positions[chosen],
+            reference_distances=self.reference_distances[chosen],
+            lobes=None if self.lobes is None else self.lobes[chosen],
         )
 
     def choose_pixels(self, rows: slice | Integers) -> NearLamps:
@@ -150,7 +143,7 @@ class NearLamps:
         """Return width and height of the rectangle around the mask (H, W), and its middle (3,) on
         the mean plane.
         """
-        rows, columns = (np.flatnonzero(mask.any(axis=axis))[[0, -1]] for axis in (1, 0))
+        rows, columns = bounds(mask)
         width, height = (float(np.ptp(places) + 1) * self.pixel_size for places in (columns, rows))
         return (width, height), self.plane_points(rows.mean()[None], columns.mean()[None])[0]
 
@@ -161,7 +154,7 @@ class NearLamps:
         Only the corners of the rectangle around the mask (H, W) are compared, as points of the mean
         plane.
         """
-        rows, columns = (np.flatnonzero(mask.any(axis=axis))[[0, -1]] for axis in (1, 0))
+        rows, columns = bounds(mask)
         row, column = np.meshgrid([*rows, rows.mean()], [*columns, columns.mean()])
         directions, _ = self.light_at(self.plane_points(row.ravel(), column.ravel()))
         return np.asarray(angle_between_deg(directions, directions[-1]).max(axis=0))
@@ -176,9 +169,9 @@ class NearLamps:
         distance = np.sqrt(np.einsum("pfc,pfc->pf", towards, towards))
         towards /= distance[..., None]
         attenuation = np.square(self.reference_distances.astype(np.float32) / distance)
-        return towards, attenuation if self.lobes is None else attenuation * _within_lobes(
-            self.lobes, towards
-        )
+        if self.lobes is not None:
+            attenuation = attenuation * _within_lobes(self.lobes, towards)
+        return towards, attenuation
 
 
 def _within_lobes(lobes: Float64Array, towards: Floats) -> Float32Array:
@@ -191,9 +184,8 @@ def _within_lobes(lobes: Float64Array, towards: Floats) -> Float32Array:
 
 
 UNIT_HINT = (
-    "Give all lengths in one unit, such as millimetres: the lamps' positions or distance, and the"
-    " pixel size or object"
-    " width"
+    "Give all lengths in one unit, such as millimetres: the lamps' positions or distance,"
+    " and the pixel size or object width"
 )
 
 
@@ -207,22 +199,19 @@ def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> li
     distances = np.linalg.norm(lamps.positions - middle, axis=1)
     nearest = int(distances.argmin())
     text = (
-        f"lamp {nearest + 1} is {distances[nearest]:.3g} from the middle of the object, which is"
-        f" {sizes[0]:.3g} wide"
+        f"lamp {nearest + 1} is {distances[nearest]:.3g} from the middle of the object,"
+        f" which is {sizes[0]:.3g} wide"
     )
     if distances[nearest] < 0.5 * min(sizes):
-        raise InputError(f"{text}: it would be inside the object", path=positions, hint=UNIT_HINT)
+        raise InputError(f"{text}: it would be inside the object", positions, hint=UNIT_HINT)
     if distances[nearest] < max(sizes):
-        return [CaptureWarning(LAMP_DISTANCE, f"A lamp is very near: {text}. {UNIT_HINT}.")]
+        problem = "A lamp is very near"
     # A position in metres instead of millimetres changes the distance a thousandfold.
-    if distances[nearest] > 300.0 * max(sizes):
-        return [
-            CaptureWarning(
-                LAMP_DISTANCE,
-                f"The lamps are so far away that their light is parallel: {text}. {UNIT_HINT}.",
-            )
-        ]
-    return []
+    elif distances[nearest] > 300.0 * max(sizes):
+        problem = "The lamps are so far away that their light is parallel"
+    else:
+        return []
+    return [CaptureWarning(LAMP_DISTANCE, f"{problem}: {text}. {UNIT_HINT}.")]
 
 
 def distant_lights(
@@ -236,18 +225,16 @@ def distant_lights(
     name = "the lamps' positions" if positions is None else positions.name
     if lamps is None:
         text = (
-            f"{name} is not used, because the size of a pixel is unknown. Give --pixel-size or"
-            " --object-width."
+            f"{name} is not used, because the size of a pixel is unknown."
+            " Give --pixel-size or --object-width."
         )
         return [CaptureWarning(NEAR_LAMPS, text)]
-    angle_deg = lamps.angles_across_deg(mask).max()
-    if angle_deg <= 2.0:
+    if (angle_deg := lamps.angles_across_deg(mask).max()) <= 2.0:
         return []
     text = (
-        f"The lamps are near: by {name}, a light direction changes by up to {angle_deg:.0f}"
-        " degrees between the middle"
-        " and the edge of the object, but the lights are treated as distant. Use --light-positions"
-        " instead of --lights."
+        f"The lamps are near: by {name}, a light direction changes by up to {angle_deg:.0f} degrees"
+        " between the middle and the edge of the object, but the lights are treated as distant."
+        " Use --light-positions instead of --lights."
     )
     return [CaptureWarning(NEAR_LAMPS, text)]
 
@@ -268,8 +255,8 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
         return []
     text = (
         f"The vectors of {path.name} have lengths from {lengths.min():.4g} to {lengths.max():.4g},"
-        " as positions of"
-        " lamps have, but are read as directions. If they are positions, use --light-positions."
+        " as positions of lamps have, but are read as directions. If they are positions,"
+        " use --light-positions."
     )
     return [CaptureWarning(NEAR_LAMPS, text)]
 
@@ -292,7 +279,7 @@ class LampOptions:
 
     def __post_init__(self) -> None:
         for one, other in (("positions", "distance"), ("pixel_size", "object_width")):
-            if getattr(self, one) is not None and getattr(self, other) is not None:
+            if None not in (getattr(self, one), getattr(self, other)):
                 raise UsageError(
                     f"{_OPTIONS[one]} and {_OPTIONS[other]} contradict each other",
                     hint="Leave one out",
@@ -326,10 +313,10 @@ class LampFiles:
 
     # the file of positions, or None if `distance` puts the lamps in the light directions
     positions: Path | None
-    # see LampOptions, as for the scale. Both of its numbers are None if it is unknown
-    distance: float | None
+    options: LampOptions
+    # of the options or of a file. Neither this nor the object's width is given if the scale is
+    # unknown
     pixel_size: float | None
-    object_width: float | None
     lobes: Path | None  # the file of the lamps' lobes, or None
     stamp: tuple[Any, ...]  # of the files that were found, from before they were read
     # whether the capture uses the lamps. If not, they are only compared with distant lights
@@ -339,17 +326,14 @@ class LampFiles:
         """Return a description of the source of the lamps' positions."""
         if not self.used:
             return f"{self.positions} is not used"
-        what, width = (
-            ("a pixel", self.pixel_size)
-            if self.object_width is None
-            else ("the object", self.object_width)
-        )
-        where = (
-            f"{self.distance:g} away" if self.positions is None else f"near, as in {self.positions}"
-        )
-        return f"{where}; {what} is {width:g} wide" + (
-            "" if self.lobes is None else f"; lobes as in {self.lobes}"
-        )
+        text = f"near, as in {self.positions}"
+        if self.positions is None:
+            text = f"{self.options.distance:g} away"
+        if self.options.object_width is None:
+            text += f"; a pixel is {self.pixel_size:g} wide"
+        else:
+            text += f"; the object is {self.options.object_width:g} wide"
+        return text if self.lobes is None else f"{text}; lobes as in {self.lobes}"
 
     def over(self, source: Any, mask: Bools, *, step: int = 1) -> NearLamps | None:
         """Return all lamps of a CaptureSource over a mask (H, W) of every step-th row and column;
@@ -362,25 +346,25 @@ class LampFiles:
         if self.positions is not None:
             positions = read_light_positions(self.positions, source.n_lights, source.light_frame)
         else:
-            positions = source.light_directions * self.distance
+            positions = source.light_directions * self.options.distance
         # float32 holds the squares of distances up to 1e19.
         if (farthest := np.abs(positions).max(initial=0)) > 1e15:
-            raise InputError(f"a lamp is {farthest:.3g} away", path=self.positions, hint=UNIT_HINT)
+            raise InputError(f"a lamp is {farthest:.3g} away", self.positions, hint=UNIT_HINT)
         pixel_size = self.pixel_size
-        if self.object_width is not None:
-            columns = np.flatnonzero(mask.any(axis=0))
-            pixel_size = (
-                self.object_width / float(columns[-1] - columns[0] + 1) / (step * window.step)
-            )
+        if self.options.object_width is not None:
+            _, (first, last) = bounds(mask)
+            pixel_size = self.options.object_width / float(last - first + 1) / (step * window.step)
         if pixel_size is None:
             return None
         shape = tuple(step * size for size in mask.shape) if window.shape is None else window.shape
-        lobes = (
-            None if self.lobes is None else _read_lobes(self.lobes, positions, source.light_frame)
-        )
-        equal = not source.intensities_measured
+        lobes = self.lobes
         lamps = NearLamps.of(
-            positions, pixel_size, shape, equal=equal, camera_matrix=camera_matrix, lobes=lobes
+            positions,
+            pixel_size,
+            shape,
+            equal=not source.intensities_measured,
+            camera_matrix=camera_matrix,
+            lobes=None if lobes is None else _read_lobes(lobes, positions, source.light_frame),
         )
         left, top, *_ = window.box or (0, 0)
         step *= window.step
@@ -404,32 +388,27 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
         positions, used = find_named(folder, LIGHT_POSITIONS), lights is None
         if positions is None and lights is not None and lights.is_file():
             positions = find_named(lights.parent, LIGHT_POSITIONS)
-    if positions is None and options.distance is None:
-        if options.given is not None:
-            problem = (
-                f"{options.given} concerns near lamps, and {folder} has no {LIGHT_POSITIONS[0]}"
-            )
+        if positions is None:
+            if options.given is None:
+                return None
             raise UsageError(
-                problem, hint="Add --light-positions FILE or --light-distance D, or leave it out"
+                f"{options.given} concerns near lamps, and {folder} has no {LIGHT_POSITIONS[0]}",
+                hint="Add --light-positions FILE or --light-distance D, or leave it out",
             )
-        return None
-    folders = [folder, *([] if positions is None else [positions.parent])]
     scaled = options.pixel_size is not None or options.object_width is not None
-    pixel_file = None if scaled else _find(folders, "pixel_size.txt")
+    pixel_file = None if scaled else _find("pixel_size.txt", folder, positions)
     scaled = scaled or pixel_file is not None
-    lobes = _find(folders, "light_lobes.txt")
-    stamp = tuple(
-        stamp_content(path) for path in (positions, pixel_file, lobes) if path is not None
-    )
+    lobes = _find("light_lobes.txt", folder, positions)
+    stamp = tuple(map(stamp_content, filter(None, (positions, pixel_file, lobes))))
     pixel_size = options.pixel_size if pixel_file is None else _read_pixel_size(pixel_file)
-    if used and not scaled and positions in (find_lights(folder), _path(options.positions)):
-        hint = (
-            "Give --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
+    if used and not scaled and positions in (find_light_file(folder), _path(options.positions)):
+        raise InputError(
+            "the scale of the lamp positions is unknown",
+            positions,
+            hint="Give --pixel-size or --object-width,"
+            " or write the width of a pixel into pixel_size.txt",
         )
-        raise InputError("the scale of the lamp positions is unknown", path=positions, hint=hint)
-    return LampFiles(
-        positions, options.distance, pixel_size, options.object_width, lobes, stamp, used and scaled
-    )
+    return LampFiles(positions, options, pixel_size, lobes, stamp, used and scaled)
 
 
 def find_camera(
@@ -440,11 +419,8 @@ def find_camera(
 
     Raises InputError if the file is wrong.
     """
-    folders = [
-        folder,
-        *([] if lamps is None or lamps.positions is None else [lamps.positions.parent]),
-    ]
-    path = _path(options.camera_matrix) or _find(folders, "camera_matrix.txt")
+    beside = None if lamps is None else lamps.positions
+    path = _path(options.camera_matrix) or _find("camera_matrix.txt", folder, beside)
     if path is None:
         return None, ()
     stamp = stamp_content(path)  # before it is read
@@ -459,10 +435,9 @@ def read_camera_matrix(path: Path) -> Float64Array:
     """Return the camera matrix (3, 3) of a text file. Raises InputError."""
     matrix = read_number_rows(path).as_array()
     if matrix.shape != (3, 3):
-        problem = f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3"
         raise InputError(
-            problem,
-            path=path,
+            f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3",
+            path,
             hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels",
         )
     ray_basis(matrix)  # rejects other numbers
@@ -477,44 +452,42 @@ def _read_lobes(path: Path, positions: Float64Array, frame: LightFrame) -> Float
     rows = read_number_rows(path).rows
     if len(rows) not in (1, len(positions)):
         raise InputError(
-            f"found {len(rows)} lines, expected 1 or {len(positions)}", path=path, hint=hint
+            f"found {len(rows)} lines, expected 1 or {len(positions)}", path, hint=hint
         )
     for numbers, line, text in rows:
         # With an exponent of 100, the intensity halves 7 degrees off the axis.
         if len(numbers) != 4 or not any(numbers[:3]) or not 0 <= numbers[3] <= 100:
-            raise InputError(
-                f'found "{text[:60]}", expected x y z mu', path=path, line=line, hint=hint
-            )
+            raise InputError(f'found "{text[:60]}", expected x y z mu', path, line=line, hint=hint)
     rows *= len(positions) // len(rows)
     lobes = np.array([row.numbers for row in rows])
     lobes[:, :3] = unit(lobes[:, :3] @ frame.matrix.T)
     away = np.einsum("fc,fc->f", lobes[:, :3], positions) >= 0
     if away.any():
         lamp = int(away.argmax())
-        hint = "The directions point from the lamps to the object"
         raise InputError(
             f"lamp {lamp + 1} shines away from the object",
-            path=path,
+            path,
             line=rows[lamp].line,
-            hint=hint,
+            hint="The directions point from the lamps to the object",
         )
     return lobes
 
 
 def _read_pixel_size(path: Path) -> float:
     lines = enumerate(read_lines(path, expected="a text file with one number"), start=1)
-    content = [(line, text.partition("#")[0].strip()) for line, text in lines]
-    content = [(line, text) for line, text in content if text] or [(1, "")]
-    line, text = content[0]
+    content = [(line, text) for line, row in lines if (text := row.partition("#")[0].strip())]
+    line, text = content[0] if content else (1, "")
     size = to_number(text) or 0.0
     if len(content) != 1 or not 0 < size < math.inf:
-        problem = f'found "{text[:40]}", expected one number above 0, the width of a pixel'
-        hint = "Write the number alone; its unit is the unit of the lamps' positions"
-        raise InputError(problem, path=path, line=line, hint=hint)
+        raise InputError(
+            f'found "{text[:40]}", expected one number above 0, the width of a pixel',
+            path,
+            line=line,
+            hint="Write the number alone; its unit is the unit of the lamps' positions",
+        )
     return size
 
 
-def _find(folders: list[Path], name: str) -> Path | None:
-    return next(
-        (path for folder in folders if (path := find_named(folder, [name])) is not None), None
-    )
+def _find(name: str, folder: Path, positions: Path | None) -> Path | None:
+    """Return the file of this name in the folder, or else beside the file of positions."""
+    return find_named(folder, [name]) or (positions and find_named(positions.parent, [name]))

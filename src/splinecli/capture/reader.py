@@ -4,13 +4,13 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from splinecli.capture import linearise, near_lamps
-from splinecli.capture.channel_lights import CHANNELS, CROSSTALK, channel_lights
+from splinecli.capture.channel_lights import CHANNELS, CROSSTALK, ChannelLights, channel_lights
 from splinecli.capture.files import (
     AMBIENT,
     CaptureFiles,
@@ -21,6 +21,7 @@ from splinecli.capture.files import (
 )
 from splinecli.capture.formats.facts import (
     UPRIGHT,
+    ImageHeader,
     common_orientation,
     exposure_factors,
     read_header,
@@ -46,39 +47,45 @@ from splinecli.system.files import StrPath
 EQUAL = "equal"  # given instead of a file of intensities: all lights have the same intensity
 
 
-def open_capture(
-    folder: StrPath,
-    *,
-    lights: StrPath | None = None,
-    intensities: StrPath | None = None,
-    mask: StrPath | None = None,
-    ground_truth: StrPath | None = None,
-    radiometry: linearise.RadiometricCalibration = linearise.AUTOMATIC,
-    white_level: float | None = None,
-    light_frame: LightFrame = USUAL_FRAME,
-    lights_format: LightForm = "xyz",
-    lamps: near_lamps.LampOptions = near_lamps.NO_LAMP_OPTIONS,
-    window: linearise.Window = linearise.WHOLE,
-    needs_lights: bool = True,
-    lights_in_channels: bool = False,
-    crosstalk: StrPath | None = None,
-) -> CaptureSource:
+@dataclass(frozen=True, kw_only=True)
+class CaptureOptions:
+    """How a capture is read. Files that are named here are used instead of those in the folder.
+
+    intensities: a file, or EQUAL.
+    radiometry: how stored values become linear light. Where it names no ambient image, one called
+        `ambient` in the folder is subtracted.
+    white_level: stored value from which an observation is considered saturated, such as 4095 for 12
+        bits. By default it is found from the files and their values (see WhiteLevel).
+    light_format: whether the rows of a light file of text are vectors or angles.
+    lamps: positions of near lamps, and the camera, unless files in the folder give them.
+    needs_lights: whether light files are read. Without them, the lights have to be estimated.
+    lights_in_channels: whether the channels of each image are observations under three lights; see
+        ChannelLights.
+    crosstalk: a file with their crosstalk, instead of that in the folder.
+    """
+
+    lights: StrPath | None = None
+    intensities: StrPath | None = None
+    mask: StrPath | None = None
+    ground_truth: StrPath | None = None
+    radiometry: linearise.RadiometricCalibration = linearise.AUTOMATIC
+    white_level: float | None = None
+    light_frame: LightFrame = USUAL_FRAME
+    light_format: LightForm = "xyz"
+    lamps: near_lamps.LampOptions = near_lamps.NO_LAMP_OPTIONS
+    window: linearise.Window = linearise.WHOLE
+    needs_lights: bool = True
+    lights_in_channels: bool = False
+    crosstalk: StrPath | None = None
+
+    @property
+    def are_equal(self) -> bool:
+        """Whether all lights are said to have the same intensity."""
+        return self.intensities is not None and str(self.intensities) == EQUAL
+
+
+def open_capture(folder: StrPath, options: CaptureOptions = CaptureOptions()) -> CaptureSource:
     """Return a capture whose files are found and whose lights are read.
-
-    Files named here are used instead of those in the folder.
-
-    Args:
-        intensities: a file, or EQUAL.
-        radiometry: how stored values become linear light. Where it names no ambient image, one
-            called `ambient` in the folder is subtracted.
-        white_level: stored value from which an observation is considered saturated, such as 4095
-            for 12 bits. By default it is found from the files and their values (see WhiteLevel).
-        lights_format: whether the rows of a light file of text are vectors or angles.
-        lamps: positions of near lamps, and the camera, unless files in the folder give them.
-        needs_lights: whether light files are read. Without them, the lights have to be estimated.
-        lights_in_channels: whether the channels of each image are observations under three lights;
-            see ChannelLights.
-        crosstalk: a file with their crosstalk, instead of that in the folder.
 
     Raises:
         InputError: find_capture_files does not recognise the folder, a light file is wrong, or the
@@ -92,55 +99,122 @@ def open_capture(
         >>> source.n_lights, source.files.images[0].name
         (10, '01.png')
     """
-    check_white_level(white_level)
-    equal = intensities is not None and str(intensities) == EQUAL
-    given = (lights, None if equal else intensities, mask, ground_truth)
+    check_white_level(options.white_level)
+    files, near, form = _find_files(Path(folder), options)
+    radiometry = options.radiometry
+    camera_matrix, of_camera = near_lamps.find_camera(Path(folder), near, options.lamps)
+    of_lamps = (*(() if near is None else near.stamp), *of_camera)
+    stamp = stamp_files(files, radiometry.flat_field, of_lamps)
+    channels, of_channels = _find_channels(files, options)
+    if channels is not None:
+        stamp = (*stamp, of_channels)
+        each = tuple(image for image in files.images for _ in range(CHANNELS))
+        files = replace(files, images=each)
+    in_folder = files.images
+    files, directions, intensities, warnings = _read_all_lights(files, options, form, channels)
+    warnings += files.warnings
+    if len(radiometry.flat_field) == len(in_folder) > 1:  # in the order of the folder's images
+        flat_of = dict(zip(in_folder, radiometry.flat_field, strict=True))
+        radiometry = replace(radiometry, flat_field=tuple(flat_of[image] for image in files.images))
+    if options.are_equal:
+        intensities = None
+    elif files.light_intensities is not None:
+        intensities = _read_intensities(files.light_intensities, files.images, in_folder, channels)
+    if channels is not None:
+        warnings.append(CaptureWarning(codes.LIGHTS_IN_CHANNELS, channels.in_words()))
+    if files.light_directions is not None and form == "xyz" and near is None:
+        warnings += near_lamps.positions_as_directions(files.light_directions)
+    facts = tuple(map(read_header, files.images))
+    factors = np.ones((len(facts), 3))
+    if intensities is None and (exposures := exposure_factors(facts)) is not None:
+        factors *= np.array(exposures[0])[:, None]
+        warnings.append(CaptureWarning(codes.EXIF_EXPOSURE, exposures[1]))
+    if radiometry.ambient is None and files.ambient is not None:
+        radiometry = replace(radiometry, ambient=files.ambient)
+        text = f"{files.ambient.name} was subtracted from all images as ambient light."
+        warnings.append(CaptureWarning(codes.AMBIENT_SUBTRACTED, text))
+    warnings += _left_out(files)
+    radiometry, of_curve = radiometry.with_stated_curve(facts)
+    warnings += of_curve
+    # Earlier versions read such images as linear, or those with a colour profile as sRGB.
+    is_decoded = radiometry.automatic and radiometry.curve != 1
+    decoded = (radiometry.curve or "sRGB",) if is_decoded else ()
+    warnings += _turned_by_viewers(facts)
+    given_level = () if options.white_level is None else (options.white_level,)
+    return CaptureSource(
+        files=files,
+        facts=facts,
+        light_directions=directions,
+        light_intensities=factors if intensities is None else intensities,
+        warnings=tuple(warnings),
+        radiometry=radiometry,
+        white_level=options.white_level,
+        intensities_known=options.are_equal or intensities is not None,
+        intensities_measured=intensities is not None,
+        light_frame=options.light_frame,
+        lamps=near,
+        camera_matrix=camera_matrix,
+        channels=channels,
+        window=options.window.on(facts[0]),
+        # Omitted if they are not given, so that earlier stamps stay valid.
+        stamp=(*stamp, *decoded, *given_level),
+    )
+
+
+def _find_files(
+    folder: Path, options: CaptureOptions
+) -> tuple[CaptureFiles, near_lamps.LampFiles | None, RowForm]:
+    """Return the files of a capture, its near lamps, and what the rows of its light file are."""
+    intensities = None if options.are_equal else options.intensities
+    given = (options.lights, intensities, options.mask, options.ground_truth)
     paths = (None if file is None else Path(file) for file in given)
-    overrides = Overrides(*paths, needs_lights=needs_lights)
-    if lamps.positions is not None and lights is not None:
+    overrides = Overrides(*paths, needs_lights=options.needs_lights)
+    if options.lamps.positions is not None and options.lights is not None:
         raise UsageError(
             "--lights and --light-positions contradict each other", hint="Leave one out"
         )
-    form: RowForm = lights_format
-    near = (
-        None if not needs_lights else near_lamps.find_lamps(Path(folder), overrides.lights, lamps)
-    )
+    form: RowForm = options.light_format
+    near = None
+    if options.needs_lights:
+        near = near_lamps.find_lamps(folder, overrides.lights, options.lamps)
     if near is not None and near.used and near.positions is not None:
-        if lights_format != "xyz":
+        if form != "xyz":
             problem = (
-                f"--light-format {lights_format} concerns light directions, but {near.positions}"
-                " has positions"
+                f"--light-format {form} concerns light directions, but {near.positions} has"
+                " positions"
             )
-            raise UsageError(
-                problem, hint="Leave it out, or use --light-distance with a file of directions"
-            )
+            hint = "Leave it out, or use --light-distance with a file of directions"
+            raise UsageError(problem, hint=hint)
         overrides, form = replace(overrides, lights=near.positions), "positions"
-    if near is not None and near.object_width is not None and window.box is not None:
+    has_width = near is not None and near.options.object_width is not None
+    if has_width and options.window.box is not None:
         raise UsageError(
             "--object-width needs the whole object in the image",
             hint="Give --pixel-size beside --crop",
         )
     files = find_capture_files(folder, overrides)
     found = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
-    files = replace(files, ambient=radiometry.ambient or found)
-    camera_matrix, of_camera = near_lamps.find_camera(Path(folder), near, lamps)
-    channels, matrix_file = None, None
-    if lights_in_channels:
-        matrix_file = (
-            Path(crosstalk) if crosstalk is not None else find_named(files.folder, (CROSSTALK,))
-        )
-        channels = channel_lights(matrix_file, len(files.images))
-    stamp = stamp_files(
-        files, radiometry.flat_field, (*(() if near is None else near.stamp), *of_camera)
-    )
-    if channels is not None:
-        stamp = (*stamp, None if matrix_file is None else stamp_content(matrix_file))
-        files = replace(
-            files, images=tuple(image for image in files.images for _ in range(CHANNELS))
-        )
-    in_folder = files.images
+    return replace(files, ambient=options.radiometry.ambient or found), near, form
+
+
+def _find_channels(
+    files: CaptureFiles, options: CaptureOptions
+) -> tuple[ChannelLights | None, str | None]:
+    """Return how channels become images of their own, and the stamp of their crosstalk."""
+    if not options.lights_in_channels:
+        return None, None
+    file = find_named(files.folder, (CROSSTALK,))
+    if options.crosstalk is not None:
+        file = Path(options.crosstalk)
+    return channel_lights(file, len(files.images)), None if file is None else stamp_content(file)
+
+
+def _read_all_lights(
+    files: CaptureFiles, options: CaptureOptions, form: RowForm, channels: ChannelLights | None
+) -> tuple[CaptureFiles, Float64Array, Float64Array | None, list[CaptureWarning]]:
+    """Return the result of _read_lights, with an error of its own for lights in channels."""
     try:
-        files, directions, found_intensities, warnings = _read_lights(files, light_frame, form)
+        return _read_lights(files, options.light_frame, form)
     except WrongCountError as error:
         if channels is None:
             raise
@@ -150,75 +224,28 @@ def open_capture(
             " G, B"
         )
         raise InputError(problem, path=error.path, hint=hint) from None
-    warnings += files.warnings
-    if (
-        len(radiometry.flat_field) == len(in_folder) > 1
-    ):  # they are in the order of the folder's images
-        flat_of = dict(zip(in_folder, radiometry.flat_field, strict=True))
-        radiometry = replace(radiometry, flat_field=tuple(flat_of[image] for image in files.images))
-    if equal:
-        found_intensities = None
-    elif files.light_intensities is not None:
-        if channels is None:
-            found_intensities = _read_intensities(files.light_intensities, files.images, in_folder)
-        else:  # a line r g b for each image
-            of_images = read_light_intensities(
-                files.light_intensities, len(files.images) // CHANNELS
-            )
-            found_intensities = np.repeat(of_images.reshape(-1, 1), 3, axis=1)
-    if channels is not None:
-        warnings.append(CaptureWarning(codes.LIGHTS_IN_CHANNELS, channels.in_words()))
-    if files.light_directions is not None and form == "xyz" and near is None:
-        warnings += near_lamps.positions_as_directions(files.light_directions)
-    facts = tuple(map(read_header, files.images))
-    factors = np.ones((len(facts), 3))
-    if found_intensities is None and (exposures := exposure_factors(facts)) is not None:
-        factors *= np.array(exposures[0])[:, None]
-        warnings.append(CaptureWarning(codes.EXIF_EXPOSURE, exposures[1]))
-    if radiometry.ambient is None and files.ambient is not None:
-        radiometry = replace(radiometry, ambient=files.ambient)
-        text = f"{files.ambient.name} was subtracted from all images as ambient light."
-        warnings.append(CaptureWarning(codes.AMBIENT_SUBTRACTED, text))
-    if files.others:
-        more = f" and {len(files.others) - 1} more" if len(files.others) > 1 else ""
-        text = (
-            f"{files.others[0].name}{more}: left out, because the name is not that of a photograph"
-            " under one of"
-        )
-        text += " the lights. To use it as one, list all images in filenames.txt."
-        warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
-    radiometry, of_curve = radiometry.with_stated_curve(facts)
-    warnings += of_curve
-    # Earlier versions read such images as linear, or those with a colour profile as sRGB.
-    decoded = (
-        (radiometry.curve or "sRGB",) if radiometry.automatic and radiometry.curve != 1 else ()
+
+
+def _left_out(files: CaptureFiles) -> list[CaptureWarning]:
+    if not files.others:
+        return []
+    more = f" and {len(files.others) - 1} more" if len(files.others) > 1 else ""
+    text = (
+        f"{files.others[0].name}{more}: left out, because the name is not that of a photograph"
+        " under one of the lights. To use it as one, list all images in filenames.txt."
     )
+    return [CaptureWarning(codes.IMAGES_LEFT_OUT, text)]
+
+
+def _turned_by_viewers(facts: Sequence[ImageHeader]) -> list[CaptureWarning]:
     orientation = common_orientation(facts)
-    if orientation != UPRIGHT:
-        text = (
-            f"Viewers turn the images (EXIF orientation {orientation}), splinecli does not: mask,"
-            " light directions and"
-            " results are in the frame of the stored pixels."
-        )
-        warnings.append(CaptureWarning(codes.EXIF_ORIENTATION, text))
-    return CaptureSource(
-        files=files,
-        facts=facts,
-        light_directions=directions,
-        light_intensities=factors if found_intensities is None else found_intensities,
-        warnings=tuple(warnings),
-        radiometry=radiometry,
-        white_level=white_level,
-        intensities_known=equal or found_intensities is not None,
-        intensities_measured=found_intensities is not None,
-        light_frame=light_frame,
-        lamps=near,
-        camera_matrix=camera_matrix,
-        channels=channels,
-        window=window.on(facts[0]),
-        # Omitted if they are not given, so that earlier stamps stay valid.
-        stamp=(*stamp, *decoded, *(() if white_level is None else (white_level,))),
+    if orientation == UPRIGHT:
+        return []
+    text = (
+        f"Viewers turn the images (EXIF orientation {orientation}), splinecli does not: mask, light"
+        " directions and results are in the frame of the stored pixels."
     )
+    return [CaptureWarning(codes.EXIF_ORIENTATION, text)]
 
 
 def _read_lights(
@@ -324,14 +351,19 @@ def _stated_size(image: Path) -> tuple[int, ...] | None:
 
 
 def _read_intensities(
-    path: Path, images: Sequence[Path], in_folder: Sequence[Path]
+    path: Path,
+    images: Sequence[Path],
+    in_folder: Sequence[Path],
+    channels: ChannelLights | None,
 ) -> Float64Array:
     """Return the intensities (F, 3) of images from a file with a line for each, or for each image
     of the folder.
     """
+    if channels is not None:  # a line r g b for each image
+        of_images = read_light_intensities(path, len(images) // CHANNELS)
+        return np.repeat(of_images.reshape(-1, 1), 3, axis=1)
     if len(images) < len(in_folder):
         with suppress(InputError):  # the file is for the chosen images, or wrong in any case
-            return read_light_intensities(path, len(in_folder))[
-                [in_folder.index(image) for image in images]
-            ]
+            chosen = [in_folder.index(image) for image in images]
+            return read_light_intensities(path, len(in_folder))[chosen]
     return read_light_intensities(path, len(images))

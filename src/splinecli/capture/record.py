@@ -13,9 +13,7 @@ from splinecli.errors import InputError, UsageError
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Integers
 from splinecli.maths.pixel_grid import ray_basis
 from splinecli.maths.robust import MIN_LIGHTS
-from splinecli.records.capture_warnings import (
-    CaptureWarning,
-)
+from splinecli.records.capture_warnings import CaptureWarning
 from splinecli.records.white_level import WhiteLevel
 
 _SIDES = (

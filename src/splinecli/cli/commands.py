@@ -144,8 +144,8 @@ def prepare(options: PrepareOptions) -> int:
     summary = prepare_pixel_set(options, Messages(quiet=options.quiet))
     in_words = (
         f"{summary['set']}: {summary['entries']} entries of {summary['scenes']} scenes,"
-        f" {summary['n_pixels']} pixels,"
-        f" {summary['bytes'] / 1e6:.0f} MB; overview in {summary['contact_sheet']}"
+        f" {summary['n_pixels']} pixels, {summary['bytes'] / 1e6:.0f} MB; overview in"
+        f" {summary['contact_sheet']}"
     )
     print_report(
         summary,
@@ -171,8 +171,8 @@ def import_weights(options: ImportOptions) -> None:
             "exists already", path=output, hint="Add --overwrite, or choose another place with -o"
         )
 
-    from splinecli.estimate.networks.weights import save_weights
     from splinecli.workshop.import_weights import import_official
+    from splinecli.workshop.save_weights import save_weights
 
     save_weights(import_official(options.li_net, options.ne_net), output)
     if not options.quiet:
@@ -246,8 +246,9 @@ def _run(trainer: Trainer, messages: Messages) -> None:
 
 
 def _losses(metrics: Metrics) -> str:
-    """Return the losses in words. Example: "1.5 minutes: loss 0.412, map 0.051, 8.31 deg, 9.02 deg
-    in validation".
+    """Return the losses in words.
+
+    Example: "1.5 minutes: loss 0.412, map 0.051, 8.31 deg, 9.02 deg in validation".
     """
     validation = (
         ""

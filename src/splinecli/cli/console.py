@@ -38,10 +38,7 @@ _SYNTAX = (
     (r"^Got unexpected extra arguments?(?:\(s\))? \((.+)\)$", r"unexpected arguments: \1"),
 )
 # options of earlier versions
-RENAMED = {
-    "--stiffness": "--discontinuity",
-    "--lights-format": "--light-format",
-}
+RENAMED = {"--stiffness": "--discontinuity", "--lights-format": "--light-format"}
 
 
 def explain(error: Exception) -> tuple[str, int]:
@@ -68,8 +65,7 @@ def error_document(error: Exception) -> dict[str, Any]:
 def printed_documents(
     *, as_list: bool, as_lines: bool
 ) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Yield a function that prints the documents of `infer`, one for each capture, as soon as the
-    capture is finished.
+    """Yield a function that prints a document of `infer` as soon as its capture is finished.
 
     Each document is a line, or an item of a single list. An error that ends the command is printed
     last.
@@ -96,9 +92,7 @@ def printed_documents(
 
 
 def _usage_message(error: Any) -> str:
-    """Return the message for click's usage error, with the value found, the value expected, and a
-    pointer to help.
-    """
+    """Return the message for click's usage error, with a pointer to help."""
     context = getattr(error, "ctx", None)
     where = context.command_path if context else "splinecli"
     text = _unknown_name(error) or error.format_message()

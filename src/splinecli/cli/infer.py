@@ -20,16 +20,13 @@ if TYPE_CHECKING:
         ClusterOptions,
         InferOptions,
         InfoOptions,
-        Reading,
+        ReadingOptions,
         WatchOptions,
     )
-    from splinecli.results.pages import Row
+    from splinecli.results.pages import IndexRow
 
 # of the last line, for these outcomes
-_WORDS = {
-    "skipped": "already done",
-    "changed": "changed but kept",
-}
+_WORDS = {"skipped": "already done", "changed": "changed but kept"}
 
 
 def infer(
@@ -70,11 +67,11 @@ def _show_all(
     summaries: bool,
 ) -> int:
     from splinecli.pipeline.batch import Status, worst_exit_code
-    from splinecli.results.pages import HEADER, INDEX, Entry
+    from splinecli.results.pages import HEADER, INDEX, IndexEntry
 
     statuses: Counter[str] = Counter()
     codes: set[int] = set()
-    rows: list[Row] = []
+    rows: list[IndexRow] = []
     for outcome in outcomes:
         document(outcome.report)
         if outcome.status == "done":
@@ -89,7 +86,7 @@ def _show_all(
         statuses[outcome.status] += 1
         codes.add(outcome.exit_code)
         if outcome.status in ("done", "skipped"):
-            rows.append(Entry.of(outcome.report).row)
+            rows.append(IndexEntry.of(outcome.report).row)
     if statuses.total() > 1:
         if rows:
             columns = [column for column in zip(HEADER, *rows, strict=True) if any(column[1:])]
@@ -142,8 +139,10 @@ def watch(context: Context, options: WatchOptions) -> None:
             "--json prints one list at the end, and watch has none", hint="Give --jsonl"
         )
     if given["shard"] is not None:
-        hint = "Watch one folder for each shard"
-        raise UsageError("--shard splits a list of captures, and watch has none", hint=hint)
+        raise UsageError(
+            "--shard splits a list of captures, and watch has none",
+            hint="Watch one folder for each shard",
+        )
     if len(given["captures"]) > 1:
         raise UsageError(
             f"found {given['captures'][0]} after the dashes, expected options of infer"
@@ -175,7 +174,7 @@ def watch(context: Context, options: WatchOptions) -> None:
             ready, is_there = [], False
 
 
-def info(reading: Reading, options: InfoOptions) -> int:
+def info(reading: ReadingOptions, options: InfoOptions) -> int:
     """Describe CAPTURE as `infer` would read it, without estimating normals.
 
     Prints the layout and files of the capture, the size and bit depth of the images, their white

@@ -1,5 +1,6 @@
-"""The Typer app, and the entry point, which turns every error into an exit code. Importing it must
-stay cheap.
+"""The Typer app and the entry point, which turns every error into an exit code.
+
+Importing it must stay cheap.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import io
 import json
 import logging
 import os
+import re
 import sys
 import textwrap
 import traceback
@@ -56,24 +58,20 @@ from splinecli.system.machine import check_address_space, keep_freed_memory
 
 
 def command(function: Callable[..., int | None], module: str) -> Callable[..., int | None]:
-    """Return a function for Typer that accepts the options of a function's records, and calls it
-    with the records.
+    """Return a function for Typer that takes the options of a function's records.
 
-    The module defines the records. It is imported here, so that it does not slow down the help of
-    other commands.
+    It calls the function with the records. The module defines the records. It is imported here, so
+    that it does not slow down the help of other commands.
     """
-    records: dict[str, type[Record]] = {}
-    parameters = []
-    for name, kind in get_type_hints(function, localns=vars(import_module(module))).items():
-        if kind is Context:
-            parameters.append(
-                inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind)
-            )
-        elif name != "return":
-            records[name] = kind
+    kinds = get_type_hints(function, localns=vars(import_module(module)))
+    del kinds["return"]
+    records = {name: kind for name, kind in kinds.items() if kind is not Context}
     options = [option for record in records.values() for option in _options(record)]
     options.sort(key=lambda option: PANELS.index(option[1].panel))
-    parameters += [_parameter(*option) for option in options]
+    parameters = [_parameter(*option) for option in options]
+    if len(records) < len(kinds):
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        parameters.append(inspect.Parameter("context", keyword, annotation=Context))
 
     def call(**given: Any) -> int | None:
         made = {name: record.from_arguments(given) for name, record in records.items()}
@@ -103,23 +101,24 @@ def _options(record: type[Record]) -> Iterator[tuple[str, Option, Any, Any]]:
 
 
 def _parameter(name: str, option: Option, kind: Any, default: Any) -> inspect.Parameter:
-    """Return Typer's parameter for a field. Record.from_arguments converts texts to numbers and
-    lists.
+    """Return Typer's parameter for a field.
+
+    Record.from_arguments converts texts to numbers and lists.
     """
     typed, metavar, complete = plain(kind), option.metavar, option.complete
-    choices = next(
-        (get_args(part) for part in (typed, *get_args(typed)) if get_origin(part) is Literal), ()
-    )
+    parts = (typed, *get_args(typed))
+    choices = next((get_args(part) for part in parts if get_origin(part) is Literal), ())
+    repeated = get_origin(typed) is list and not option.items
     if choices:
         metavar, complete = "|".join(choices), choices
     elif option.items:
         complete = complete_list(option.items)
-    if choices or option.items or option.parse is not None or number_of(kind) is not None:
-        typed = list[str] if option.repeated else str
+    if choices or option.items or option.parse or number_of(kind):
+        typed = list[str] if repeated else str
     if default is NODEFAULT:
         default = inspect.Parameter.empty
     elif isinstance(default, tuple):
-        default = (list(map(str, default)) if option.repeated else ",".join(default)) or None
+        default = (list(map(str, default)) if repeated else ",".join(default)) or None
     elif default is not None and not isinstance(default, bool):
         default = str(default)
     if default is None:
@@ -127,16 +126,18 @@ def _parameter(name: str, option: Option, kind: Any, default: Any) -> inspect.Pa
     if complete is not None and not callable(complete):
         complete = _offer(complete)
     # By default, Typer refuses a path without permission. One such capture would then end a batch.
-    common: dict[str, Any] = {"help": option.help, "autocompletion": complete, "readable": False}
+    shared: dict[str, Any] = {
+        "metavar": metavar,
+        "help": option.help,
+        "autocompletion": complete,
+        "readable": False,
+    }
     info: Any
     if option.is_argument:
-        info = Argument(metavar=metavar, show_default=False, **common)
+        info = Argument(show_default=False, **shared)
     else:
-        names = option.names or (long_name(name, option),)
-        shown = True if option.default is None else option.default
-        info = TyperOption(
-            *names, metavar=metavar, show_default=shown, rich_help_panel=option.panel, **common
-        )
+        names, shown = option.names.split() or [long_name(name, option)], option.default or True
+        info = TyperOption(*names, show_default=shown, rich_help_panel=option.panel, **shared)
     return inspect.Parameter(
         name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[typed, info]
     )
@@ -147,20 +148,17 @@ def _offer(names: Collection[str]) -> Callable[[], list[str]]:
 
 
 # the command whose JSON is a list of documents, and the option that asks for it
-INFER, JSON = (
-    "infer",
-    "--json",
-)
+INFER, JSON = "infer", "--json"
 
-_FUNCTIONS: dict[str, tuple[Callable[..., int | None], ...]] = {
-    "splinecli.pipeline.infer_options": (infer, watch, info),
-    "splinecli.pipeline.options": (calibrate, integrate, evaluate),
-    "splinecli.workshop.options": (prepare, train, import_weights),
+_MODULES: dict[str, tuple[Callable[..., int | None], ...]] = {
+    "pipeline.infer_options": (infer, watch, info),
+    "pipeline.options": (calibrate, integrate, evaluate),
+    "workshop.options": (prepare, train, import_weights),
 }
 COMMANDS = {
-    each.__name__.replace("_", "-"): (each, module)
-    for module, part in _FUNCTIONS.items()
-    for each in part
+    each.__name__.replace("_", "-"): (each, f"splinecli.{module}")
+    for module, functions in _MODULES.items()
+    for each in functions
 }
 """Name of a command -> its function, and the module that declares its options."""
 
@@ -178,24 +176,17 @@ class Command(TyperCommand):
         return typer.main.get_command(alone)
 
     def __getattribute__(self, name: str) -> Any:
-        """Return an attribute, creating it now if it depends on the options, because their imports
-        are slow.
-        """
-        return (
-            getattr(self._made, name)
-            if name in ("params", "callback")
-            else super().__getattribute__(name)
-        )
+        """Return an attribute, creating the options only now, because their imports are slow."""
+        own = self._made if name in ("params", "callback") else super()
+        return own.__getattribute__(name)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments. The context is added to parser errors, so that the message names the
-        command.
+        """Parse the arguments.
+
+        The context is added to parser errors, so that the message names the command.
         """
-        # the parser removes them from the list
-        wants_json, wants_lines = (
-            JSON in args,
-            "--jsonl" in args,
-        )
+        # The parser removes them from the list.
+        wants_json, wants_lines = JSON in args, "--jsonl" in args
         try:
             return super().parse_args(ctx, args)
         except ParserError as error:
@@ -237,8 +228,9 @@ class Command(TyperCommand):
             raise
 
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-        """Return the completions of a word, each with one line of help: shells treat a second line
-        as another word.
+        """Return the completions of a word, each with one line of help.
+
+        Shells treat a second line as another word.
         """
         items = super().shell_complete(ctx, incomplete)
         for item in items:  # Typer breaks the help beside an option at 80 columns
@@ -246,13 +238,8 @@ class Command(TyperCommand):
         return items
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return the parts of the usage line, without the braces that Typer puts around
-        arguments.
-        """
-        return [
-            piece.translate({ord(brace): None for brace in "{}"})
-            for piece in super().collect_usage_pieces(ctx)
-        ]
+        """Return the parts of the usage line, without the braces that Typer adds."""
+        return [re.sub("[{}]", "", piece) for piece in super().collect_usage_pieces(ctx)]
 
     def get_help_option(self, ctx: Any) -> Any:
         """Return the option --help, in the panel of the output."""
@@ -289,14 +276,10 @@ class Commands(TyperGroup):
 app = typer.Typer(
     name="splinecli",
     cls=Commands,
-    help=(
-        "Surface normals from a few photographs under known lights (photometric stereo with"
-        " SPLINE-Net)."
-    ),
-    epilog=(
-        "Exit codes: 0 done, 1 defect, 2 usage, 3 bad input, 4 weights or configuration, 5 output,"
-        " 130 interrupted."
-    ),
+    help="Surface normals from a few photographs under known lights (photometric stereo with"
+    " SPLINE-Net).",
+    epilog="Exit codes: 0 done, 1 defect, 2 usage, 3 bad input, 4 weights or configuration, 5"
+    " output, 130 interrupted.",
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -326,9 +309,7 @@ for _name, (_function, _) in COMMANDS.items():
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run `splinecli ARGS` and return the exit code (the contract is in
-    docs/files-and-frames.md).
-    """
+    """Run `splinecli ARGS` and return the exit code (see docs/files-and-frames.md)."""
     _repair_streams()
     # By default, PyTorch's threads spin while they wait for each other. On a machine that is busy
     # with other work this takes cores from the thread that computes. PyTorch reads the variable
@@ -366,11 +347,10 @@ def _run_command(args: Sequence[str] | None) -> int:
 
 
 class UntilClosed:
-    """A text stream that drops all output once its pipe is closed. All other attributes are the
-    stream's.
+    """A text stream that drops all output once its pipe is closed.
 
-    With a plain stream, the next line that a command prints would raise an error and end the
-    command's work.
+    All other attributes are the stream's. With a plain stream, the next line that a command prints
+    would raise an error and end the command's work.
     """
 
     def __init__(self, stream: TextIO) -> None:

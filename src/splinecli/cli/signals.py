@@ -1,5 +1,6 @@
-"""End the process with exit code 130 on Ctrl-C and SIGTERM (sent by job schedulers), SIGTERM within
-two seconds.
+"""End the process with exit code 130 on Ctrl-C and SIGTERM.
+
+SIGTERM, which job schedulers send, ends it within two seconds.
 """
 
 import os
@@ -17,12 +18,12 @@ DEFERRED = threading.Event()  # set when a signal arrives during an import, whic
 
 
 def end_on_signals() -> None:
-    """Raise KeyboardInterrupt in the main thread at Ctrl-C and SIGTERM; end the process if SIGTERM
-    does not end it.
+    """Raise KeyboardInterrupt in the main thread at Ctrl-C and SIGTERM.
 
-    Python delivers a signal only between two of its instructions. One call into a library may take
-    minutes, and an exception in a callback of a library is lost. A separate thread is notified of
-    the signal immediately.
+    If SIGTERM does not end the process this way, it is ended from another thread. Python delivers a
+    signal only between two of its instructions. One call into a library may take minutes, and an
+    exception in a callback of a library is lost. A separate thread is notified of the signal
+    immediately.
     """
     signal.signal(signal.SIGTERM, _interrupt)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored, as by nohup
@@ -36,9 +37,7 @@ def end_on_signals() -> None:
 
 
 def ignore_signals() -> None:
-    """Ignore SIGTERM and Ctrl-C from now on, because the work is done and only the exit code
-    remains to be returned.
-    """
+    """Ignore SIGTERM and Ctrl-C from now on, because only the exit code remains to be returned."""
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
 
@@ -52,8 +51,9 @@ def report_interruption() -> int:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, or defer it until an import is done: trimesh, for one, continues
-    after any exception.
+    """Raise KeyboardInterrupt, or defer it until an import is done.
+
+    The import of trimesh, for one, continues after any exception.
     """
     while frame is not None:
         if frame.f_code.co_filename == "<frozen importlib._bootstrap>":

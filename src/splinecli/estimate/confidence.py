@@ -22,10 +22,7 @@ from splinecli.maths.robust import absolute_weights, fit_robustly, fit_scaled_no
 from splinecli.system.machine import side_by_side
 
 # with fewer, the residuals of a fit are not enough to assess a capture
-FEWEST_LIGHTS, FEWEST_PIXELS = (
-    5,
-    50,
-)
+_FEWEST_LIGHTS, _FEWEST_PIXELS = 5, 50
 _FITS = 4
 _LEAST_SHARE, _LEAST_DEG = 1e-3, 0.1  # added before a logarithm is taken
 
@@ -161,7 +158,7 @@ def capture_features(
     pixels.
     """
     n_lights = len(lights)
-    if n_lights < FEWEST_LIGHTS:
+    if n_lights < _FEWEST_LIGHTS:
         return None
     rows = np.arange(
         0, len(normals), -(-len(normals) // max(1500, 3 * MIN_PIXELS_PER_LIGHT * n_lights // 2))
@@ -170,7 +167,7 @@ def capture_features(
     brightness = light.observations.mean(axis=1, dtype=np.float64)
     bright = float(np.quantile(brightness, 0.95))
     kept = brightness > 0.1 * bright  # darker pixels carry no information about the capture
-    if np.count_nonzero(kept) < FEWEST_PIXELS:
+    if np.count_nonzero(kept) < _FEWEST_PIXELS:
         return None
     values = light.observations[kept].astype(np.float64)
     values /= values.max(axis=1, keepdims=True)

@@ -18,13 +18,12 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture import Capture
 from splinecli.errors import SplinecliError
 from splinecli.estimate.confidence import add_common_error, correct_errors
 from splinecli.estimate.methods import Estimator, make_estimator
-from splinecli.estimate.methods.estimator import TILE_PIXELS, confidence
+from splinecli.estimate.methods.estimator import TILE_PIXELS, confident_share
 from splinecli.lights import lighting
 from splinecli.lights.lighting import (
     IndirectLight,
@@ -34,8 +33,9 @@ from splinecli.lights.lighting import (
     PixelPlaces,
     parts_of_pixels,
 )
+from splinecli.maths import Bools, Float32Array
 from splinecli.maths.normals import AngularErrors, angular_error_map_deg, summarise_errors
-from splinecli.maths.pixel_grid import Blocks, rays_at
+from splinecli.maths.pixel_grid import Blocks, on_map, rays_at, slices
 from splinecli.surface.integration import integrate_normals
 from splinecli.system.machine import return_freed_memory
 from splinecli.system.progress import Clock, Progress, ignore
@@ -64,10 +64,10 @@ def find_surface(capture: Capture) -> Capture:
         normals = light.in_frame_of_capture(
             estimator.estimate(light.observations, light.directions)
         )
-        normal_map = np.zeros((*blocks.mask.shape, 3))
-        normal_map[blocks.mask] = normals
         depth = integrate_normals(
-            normal_map, blocks.mask, blocks.shrink_camera(lamps.camera_matrix)
+            on_map(normals.astype(np.float64), blocks.mask),
+            blocks.mask,
+            blocks.shrink_camera(lamps.camera_matrix),
         )
         if lamps.camera_matrix is None:
             depth *= blocks.step  # from blocks to pixels
@@ -91,11 +91,11 @@ class NormalEstimate:
     """
 
     capture: Capture
-    normal_map: NDArray[np.float32]
+    normal_map: Float32Array
     seconds: float
-    error_map_deg: NDArray[np.float32] | None = None
+    error_map_deg: Float32Array | None = None
     errors: AngularErrors | None = None
-    confidence_map: NDArray[np.float32] | None = None
+    confidence_map: Float32Array | None = None
     capture_judged: bool = False
 
     @property
@@ -136,27 +136,20 @@ def estimate_normals(
     return_freed_memory()
     seconds = time.perf_counter() - started
     _check_unit(normals, estimator.name)
-    confidence_map = None
-    if errors is not None:
-        confidence_map = np.zeros(capture.mask.shape, np.float32)
-        confidence_map[capture.mask] = _confidence(errors)
+    confidence_map = None if errors is None else on_map(_confidence(errors), capture.mask)
     del errors
-    normal_map = np.zeros((*capture.mask.shape, 3), np.float32)
-    normal_map[capture.mask] = normals
+    normal_map = on_map(normals, capture.mask)
     del normals
-    if capture.ground_truth is None:
-        return NormalEstimate(
-            capture, normal_map, seconds, confidence_map=confidence_map, capture_judged=judged
-        )
-    error_map = angular_error_map_deg(normal_map, capture.ground_truth, capture.mask)
-    return NormalEstimate(
-        capture, normal_map, seconds, error_map, summarise_errors(error_map), confidence_map, judged
-    )
+    error_map = summary = None
+    if capture.ground_truth is not None:
+        error_map = angular_error_map_deg(normal_map, capture.ground_truth, capture.mask)
+        summary = summarise_errors(error_map)
+    return NormalEstimate(capture, normal_map, seconds, error_map, summary, confidence_map, judged)
 
 
 def _estimate(
     capture: Capture, estimator: Estimator, progress: Progress, clock: Clock
-) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, bool]:
+) -> tuple[Float32Array, Float32Array | None, bool]:
     """Return the normals (P, 3), the distributions (P, 2) of their errors, and whether these cover
     the whole capture.
 
@@ -165,23 +158,21 @@ def _estimate(
     found = estimate_pixels(
         capture.mask, capture.observations, lighting_on(capture), estimator, progress, clock
     )
-    normals, errors = found.normals, found.errors
-    refiner = estimator.refiner
-    if refiner is not None and errors is not None:
+    normals, errors, lighting_at = found
+    if errors is None:
+        return normals, None, False
+    if estimator.refiner is not None:
         advance = clock.begin("refine", capture.n_pixels, "refining")
-        refiner.refine(
-            capture.mask, capture.observations, found.lighting_at, normals, errors, progress=advance
+        estimator.refiner.refine(
+            capture.mask, capture.observations, lighting_at, normals, errors, progress=advance
         )
-    judged = errors is not None and correct_errors(
-        capture, estimator, found.lighting_at, normals, errors
+    judged = correct_errors(capture, estimator, lighting_at, normals, errors)
+    of_lights = (
+        () if capture.light_errors_deg is None else (float(capture.light_errors_deg.mean()),)
     )
-    if errors is not None:
-        found_lights = (
-            [] if capture.light_errors_deg is None else [float(capture.light_errors_deg.mean())]
-        )
-        for error_deg in (*found_lights, *(warning.error_deg for warning in capture.warnings)):
-            if error_deg:
-                add_common_error(errors, error_deg)
+    for error_deg in (*of_lights, *(warning.error_deg for warning in capture.warnings)):
+        if error_deg:
+            add_common_error(errors, error_deg)
     return normals, errors, judged
 
 
@@ -198,14 +189,14 @@ class PixelEstimates(NamedTuple):
     that was removed.
     """
 
-    normals: NDArray[np.float32]
-    errors: NDArray[np.float32] | None
+    normals: Float32Array
+    errors: Float32Array | None
     lighting_at: LightingAt
 
 
 def estimate_pixels(
-    mask: NDArray[np.bool_],
-    observations: NDArray[np.float32],
+    mask: Bools,
+    observations: Float32Array,
     lighting_without: Callable[[IndirectLight | None, PixelIndices], PixelLighting],
     estimator: Estimator,
     progress: Progress = ignore,
@@ -266,43 +257,36 @@ def lighting_on(capture: Capture) -> Callable[[IndirectLight | None, PixelIndice
     """Return a function for the light of some of a capture's pixels: see `lighting_without` of
     estimate_pixels.
     """
-    lamps, directions, camera_matrix = (
-        capture.lamps,
-        capture.light_directions,
-        capture.camera_matrix,
-    )
     places = PixelPlaces(capture.mask)
 
     def lighting_without(indirect: IndirectLight | None, pixels: PixelIndices) -> PixelLighting:
         observations = capture.observations[pixels]
         if indirect is not None:
             observations = indirect.remove(observations, pixels)
-        if lamps is not None:
-            return PixelLighting.of(observations, lamps.choose_pixels(pixels))
-        if camera_matrix is None:
-            return PixelLighting(observations, directions)
-        return PixelLighting.distant(
-            observations, directions, rays_at(*places.places(pixels), camera_matrix)
-        )
+        if capture.lamps is not None:
+            return PixelLighting.of(observations, capture.lamps.choose_pixels(pixels))
+        if capture.camera_matrix is None:
+            return PixelLighting(observations, capture.light_directions)
+        rays = rays_at(*places.places(pixels), capture.camera_matrix)
+        return PixelLighting.distant(observations, capture.light_directions, rays)
 
     return lighting_without
 
 
-def _confidence(errors: NDArray[np.float32]) -> NDArray[np.float32]:
+def _confidence(errors: Float32Array) -> Float32Array:
     """Return the confidence (P,) from distributions of errors (P, 2), without further arrays of
     their size.
     """
     found = np.empty(len(errors), np.float32)
-    for start in range(0, len(errors), TILE_PIXELS):
-        found[start : start + TILE_PIXELS] = confidence(errors[start : start + TILE_PIXELS])
+    for part in slices(len(errors), TILE_PIXELS):
+        found[part] = confident_share(errors[part])
     return found
 
 
-def _check_unit(normals: NDArray[np.float32], method: str) -> None:
+def _check_unit(normals: Float32Array, method: str) -> None:
     # A zero normal would have an error of 0 degrees, and NaN would be left out of the mean.
-    for start in range(0, len(normals), TILE_PIXELS):
-        length = np.linalg.norm(normals[start : start + TILE_PIXELS], axis=1)
-        if not (
-            np.abs(length - 1) <= 1e-2
-        ).all():  # accepts float16 and bfloat16, rejects zero vectors and NaN
+    for part in slices(len(normals), TILE_PIXELS):
+        length = np.linalg.norm(normals[part], axis=1)
+        # accepts float16 and bfloat16, rejects zero vectors and NaN
+        if not (np.abs(length - 1) <= 1e-2).all():
             raise SplinecliError(f"method {method} gave normals that are not unit vectors")

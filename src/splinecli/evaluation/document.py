@@ -1,5 +1,4 @@
-"""The files that an evaluation writes: results.json, results.csv, tables, plots, and a report as
-one HTML file.
+"""The files that an evaluation writes: results, tables, plots, and a report in HTML.
 
 All functions take one evaluation, or several with the same methods that differ in n_lights,
 light_noise_deg or both.
@@ -9,7 +8,7 @@ import csv
 import io
 import json
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -17,10 +16,16 @@ import numpy as np
 
 from splinecli._version import __version__
 from splinecli.errors import printable
-from splinecli.evaluation import protocol as protocol_module
 from splinecli.evaluation import tables
 from splinecli.evaluation.figures import CaptureFigure, light_noise_curves, lights_curves
-from splinecli.evaluation.protocol import Evaluation, Protocol, heading, lights_value
+from splinecli.evaluation.protocol import (
+    EVERY_CAPTURE,
+    Evaluation,
+    Protocol,
+    all_skipped,
+    heading,
+    lights_value,
+)
 from splinecli.evaluation.tables import AVERAGE, compare, table_rows
 from splinecli.records.documents import (
     ComparisonReport,
@@ -58,8 +63,7 @@ Table = list[list[Cell]]  # a header row, then rows whose first cell is a header
 def html_report(
     evaluations: Sequence[Evaluation], figures: Sequence[tuple[str, bytes]], notes: Sequence[str]
 ) -> str:
-    """Return the report of one evaluation, or of several that differ in the lights or the light
-    noise.
+    """Return the report of one evaluation, or of several with different lights or light noise.
 
     `figures` are pairs of a caption, which also serves as alternative text, and a PNG. `notes` are
     sentences about the captures.
@@ -70,7 +74,7 @@ def html_report(
         title=f"{_count(len(first.methods), 'method')} on {_count(len(captures), 'capture')}",
         protocol=_protocol(evaluations),
         notes=notes,
-        skipped=[(s.capture, s.reason) for s in protocol_module.all_skipped(evaluations)],
+        skipped=[(s.capture, s.reason) for s in all_skipped(evaluations)],
         summary=_summary(evaluations) if len(evaluations) > 1 else None,
         several_methods=len(first.methods) > 1,
         sections=[_section(evaluation) for evaluation in evaluations],
@@ -83,25 +87,22 @@ def _protocol(evaluations: Sequence[Evaluation]) -> list[tuple[str, str]]:
     first = evaluations[0].protocol
     lights = dict.fromkeys(f"{lights_value(e.protocol)} lights" for e in evaluations)
     noises = dict.fromkeys(f"{e.protocol.light_noise_deg:g}" for e in evaluations)
-    drawn = (
-        "at random from the seed" if first.draws_file is None else f"as in {first.draws_file.name}"
-    )
+    drawn = f"as in {first.draws_file.name}" if first.draws_file else "at random from the seed"
     trials = sorted({r.trials for e in evaluations for r in e.results}, reverse=True)
+    others = {EVERY_CAPTURE: "every other capture"}
     left_out = ", ".join(
-        f"the first {count} of"
-        f" {'every other capture' if name == protocol_module.EVERY_CAPTURE else name}"
-        for name, count in first.skip_first.items()
+        f"the first {count} of {others.get(name, name)}" for name, count in first.skip_first.items()
     )
     everything = "all that have ground truth"
     at_most = f"at most {first.max_pixels} of each capture, at random"
-    weights = [
-        f"{method}: {used['weights']['name']} (SHA-256 {used['weights']['sha256'][:12]})"
+    weights = ", ".join(
+        f"{method}: {weights['name']} (SHA-256 {weights['sha256'][:12]})"
         for method, used in evaluations[0].settings.items()
-        if used["weights"] is not None
-    ]
-    return [
+        if (weights := used["weights"]) is not None
+    )
+    rows = [
         ("Methods", ", ".join(evaluations[0].methods)),
-        *([("Weights", ", ".join(weights))] if weights else []),
+        ("Weights", weights),
         ("Captures", ", ".join(_captures(evaluations))),
         ("Image values", _AS_STORED if first.as_stored else _RESTORED),
         ("Lights", ", ".join(lights)),
@@ -109,24 +110,24 @@ def _protocol(evaluations: Sequence[Evaluation]) -> list[tuple[str, str]]:
         ("Draws of lights", f"{drawn}, the same for all methods"),
         ("Seed", str(first.seed)),
         ("Light noise", "none" if list(noises) == ["0"] else f"{', '.join(noises)} degrees"),
-        *([("Images left out", left_out)] if left_out else []),
+        ("Images left out", left_out),
         ("Pixels scored", everything if first.max_pixels is None else at_most),
         ("splinecli", __version__),
     ]
+    return [(term, value) for term, value in rows if value]
 
 
 def _section(evaluation: Evaluation) -> dict[str, Any]:
     comparisons = compare(evaluation)
     average = [c for c in comparisons if c.capture == AVERAGE]
+    many = len(average) > _MOST_SENTENCES
     return {
         "heading": heading(evaluation.protocol),
         "errors": _error_table(evaluation),
         "seconds": _seconds_table(evaluation),
-        "sentences": [tables.in_words(c) for c in average]
-        if len(average) <= _MOST_SENTENCES
-        else [],
-        "matrix": _matrix(evaluation.methods, average) if len(average) > _MOST_SENTENCES else None,
-        "pairs": [_pair_row(c) for c in comparisons],
+        "sentences": [] if many else list(map(tables.comparison_in_words, average)),
+        "matrix": _matrix(evaluation.methods, average) if many else None,
+        "pairs": list(map(_pair_row, comparisons)),
     }
 
 
@@ -134,15 +135,15 @@ def _summary(evaluations: Sequence[Evaluation]) -> Table:
     """Return a table of methods by evaluations, the last columns of their tables."""
     columns = [[Cell(name) for name in ("method", *evaluations[0].methods)]]
     for evaluation in evaluations:
-        columns.append(
-            [Cell(heading(evaluation.protocol)), *(row[-1] for row in _error_table(evaluation)[1:])]
-        )
+        averages = [row[-1] for row in _error_table(evaluation)[1:]]
+        columns.append([Cell(heading(evaluation.protocol)), *averages])
     return [list(row) for row in zip(*columns, strict=True)]
 
 
 def _error_table(evaluation: Evaluation) -> Table:
-    """Return a table of methods by captures and the average: MAE and its standard deviation over
-    the trials.
+    """Return a table of methods by captures, with the average: MAE and its standard deviation.
+
+    The deviation is over the trials.
     """
     header, *rows = table_rows(evaluation)
     best = tables.best_cells([header, *rows])
@@ -176,17 +177,16 @@ def _seconds_table(evaluation: Evaluation) -> Table:
 
 
 def _matrix(methods: Sequence[str], comparisons: Sequence[ComparisonReport]) -> Table:
-    """Return a table of MAE differences, row method minus column method; significant ones are
-    marked.
+    """Return a table of MAE differences, row method minus column method.
+
+    Significant differences are marked.
     """
     cells = {}
     for c in comparisons:
-        for row, column, difference in (
-            (c.first, c.second, c.difference_deg),
-            (c.second, c.first, -c.difference_deg),
-        ):
+        for sign, pair in ((1, (c.first, c.second)), (-1, (c.second, c.first))):
+            difference = sign * c.difference_deg
             mark: Mark = "" if not c.differs else "best" if difference < 0 else "star"
-            cells[row, column] = Cell(_signed(difference), mark=mark)
+            cells[pair] = Cell(_signed(difference), mark=mark)
     body = [
         [Cell(row), *(cells.get((row, column), Cell("")) for column in methods)] for row in methods
     ]
@@ -199,11 +199,8 @@ def _pair_row(c: ComparisonReport) -> dict[str, str]:
     else:
         interval = " to ".join(map(_signed, c.interval_deg))
         p_value = tables.p_in_words(c.p_holm)
-    verdict = {
-        None: "",
-        True: f"{c.first if c.difference_deg < 0 else c.second} is better",
-        False: "no",
-    }
+    better = c.first if c.difference_deg < 0 else c.second
+    verdict = {None: "", True: f"{better} is better", False: "no"}
     return {
         "capture": c.capture,
         "pair": f"{c.first} {_MINUS} {c.second}",
@@ -242,19 +239,18 @@ TRIALS, REPORT, RESULTS, FIGURES = "trials.jsonl", "report.html", "results.json"
 
 
 def _make_plots(evaluations: Sequence[Evaluation]) -> dict[str, tuple[str, bytes]]:
-    """Return plots of the error against each setting that varies, as captions and PNGs by file
-    name.
+    """Return plots of the error against each setting that varies, by file name.
+
+    Each has a caption and a PNG.
     """
     plots: dict[str, tuple[str, bytes]] = {}
     if not set.intersection(*(set(evaluation.captures) for evaluation in evaluations)):
         return plots
-    if len({evaluation.protocol.n_lights for evaluation in evaluations}) > 1:
-        plots[LIGHT_PLOT] = ("Error against the number of lights.", lights_curves(evaluations))
-    if len({evaluation.protocol.light_noise_deg for evaluation in evaluations}) > 1:
-        plots[LIGHT_NOISE_PLOT] = (
-            "Error against the light noise.",
-            light_noise_curves(evaluations),
-        )
+    protocols = [evaluation.protocol for evaluation in evaluations]
+    if len({protocol.n_lights for protocol in protocols}) > 1:
+        plots[LIGHT_PLOT] = "Error against the number of lights.", lights_curves(evaluations)
+    if len({protocol.light_noise_deg for protocol in protocols}) > 1:
+        plots[LIGHT_NOISE_PLOT] = "Error against the light noise.", light_noise_curves(evaluations)
     return plots
 
 
@@ -264,11 +260,10 @@ def write_results(
     figures: Sequence[CaptureFigure] | None,
     relit: Sequence[RelightingReport] | None = None,
 ) -> dict[str, Any]:
-    """Write all files, replacing an earlier evaluation (see new_files). The caller has locked the
-    folder.
+    """Write all files, replacing an earlier evaluation (see new_files).
 
-    If `figures` is None, the figures of an earlier evaluation are kept. Returns the content of
-    results.json.
+    The caller has locked the folder. If `figures` is None, the figures of an earlier evaluation are
+    kept. Returns the content of results.json.
     """
     document, plots = results_document(evaluations), _make_plots(evaluations)
     if relit is not None:
@@ -310,7 +305,7 @@ def results_document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
         "comparisons": [
             _rounded(c.as_dict()) for evaluation in evaluations for c in compare(evaluation)
         ],
-        "skipped": [skipped.as_dict() for skipped in protocol_module.all_skipped(evaluations)],
+        "skipped": [skipped.as_dict() for skipped in all_skipped(evaluations)],
         "notes": list(
             dict.fromkeys(note for evaluation in evaluations for note in evaluation.notes)
         ),
@@ -319,9 +314,7 @@ def results_document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
 
 
 def results_csv(evaluations: Sequence[Evaluation]) -> str:
-    """Return a header and a line for each result, with the names and values of `results` in
-    results.json.
-    """
+    """Return a header and a line for each result, as in `results` of results.json."""
     text = io.StringIO()
     records = _records(evaluations)
     for record in records:
@@ -333,8 +326,9 @@ def results_csv(evaluations: Sequence[Evaluation]) -> str:
 
 
 def _as_text_cell(value: Any) -> Any:
-    """Return a value as a one-line cell; an apostrophe marks it as text if a spreadsheet could read
-    a formula.
+    """Return a value as a one-line cell.
+
+    An apostrophe marks it as text if a spreadsheet could read it as a formula.
     """
     if not isinstance(value, str):
         return value
@@ -344,19 +338,15 @@ def _as_text_cell(value: Any) -> Any:
 
 def _protocol_record(protocols: Sequence[Protocol]) -> dict[str, Any]:
     first = protocols[0]
-    return ProtocolReport(
-        n_lights=_one_or_list([lights_value(protocol) for protocol in protocols]),
-        trials=first.trials,
-        seed=first.seed,
-        draws=None if first.draws_file is None else first.draws_file.name,
-        light_noise_deg=_one_or_list([protocol.light_noise_deg for protocol in protocols]),
-        max_pixels=first.max_pixels,
-        skip_first=dict(first.skip_first),
-        as_stored=first.as_stored,
-        white_level=first.white_level,
-        light_error_deg=first.light_error_deg,
-        lights_estimated=first.finds_lights,
-    ).as_dict()
+    names = ProtocolReport.__struct_fields__
+    values: dict[str, Any] = {name: getattr(first, name, None) for name in names}
+    values |= {
+        "n_lights": _one_or_list(map(lights_value, protocols)),
+        "draws": first.draws_file and first.draws_file.name,
+        "light_noise_deg": _one_or_list(protocol.light_noise_deg for protocol in protocols),
+        "lights_estimated": first.finds_lights,
+    }
+    return ProtocolReport(**values).as_dict()
 
 
 def _records(evaluations: Sequence[Evaluation]) -> list[dict[str, Any]]:
@@ -403,6 +393,6 @@ def _rounded(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: rounded(name, value) for name, value in values.items()}
 
 
-def _one_or_list(values: Sequence[Any]) -> Any:
+def _one_or_list(values: Iterable[Any]) -> Any:
     different = list(dict.fromkeys(values))
     return different[0] if len(different) == 1 else different

@@ -320,7 +320,7 @@ def _observation_maps(
     return observation_map_figure(
         maps.sparse,
         maps.dense,
-        maps.every if whole.n_lights > capture.n_lights else None,
+        {"true map, all lights": maps.every} if whole.n_lights > capture.n_lights else {},
         pixels=np.stack([rows, columns], axis=1),
         error_deg=errors_deg[rows, columns],
         title=title,

@@ -1,5 +1,6 @@
-"""The protocol of an evaluation (draws of lights, trials, noise, pixels, how captures are read) and
-its outcome.
+"""The protocol of an evaluation and its outcome.
+
+It has draws of lights, trials, noise, pixels, and how captures are read.
 """
 
 import math
@@ -38,10 +39,9 @@ class DrawsFile:
         return len(self.draws[0])
 
     def check_against(self, light_directions: Float64Array, *, skipped: int = 0) -> None:
-        """Raise InputError, with the line number, for a draw that does not fit a capture under
-        these lights (F, 3).
+        """Raise InputError for a draw that does not fit a capture under these lights (F, 3).
 
-        Draws must not include the first `skipped` lights.
+        The error has the line number. Draws must not include the first `skipped` lights.
         """
         available = len(light_directions)
         for draw, line in zip(self.draws, self.lines, strict=True):
@@ -60,12 +60,12 @@ class DrawsFile:
 
 
 def read_draws(path: Path) -> DrawsFile:
-    """Return the draws in a text file. Each line is one draw: zero-based light indices separated by
-    spaces or commas.
+    """Return the draws in a text file.
 
-    "#" comments and blank lines are skipped. Raises InputError, with the line number, for a word
-    that is not a light index, a repeated index, fewer than three lights, or a number of lights that
-    differs from the first draw; also for a file without draws.
+    Each line is one draw: zero-based light indices separated by spaces or commas. "#" comments and
+    blank lines are skipped. Raises InputError, with the line number, for a word that is not a light
+    index, a repeated index, fewer than three lights, or a number of lights that differs from the
+    first draw; also for a file without draws.
     """
     draws, lines = list[Draw](), list[int]()
     for line, text in enumerate(read_lines(path), start=1):
@@ -100,8 +100,11 @@ def _read_draw(words: list[str], n_lights: int, path: Path, line: int) -> Draw:
             f"found {len(draw)} light indices, expected at least {MIN_LIGHTS}", path=path, line=line
         )
     if len(draw) != n_lights:
-        problem = f"found {len(draw)} light indices, expected {n_lights} as in the first draw"
-        raise InputError(problem, path=path, line=line)
+        raise InputError(
+            f"found {len(draw)} light indices, expected {n_lights} as in the first draw",
+            path=path,
+            line=line,
+        )
     return draw
 
 
@@ -162,8 +165,9 @@ def lights_value(protocol: Protocol) -> int | Literal["all"]:
 
 
 def heading(protocol: Protocol) -> str:
-    """Return the settings that differ between evaluations: "10 lights", "all lights, light noise of
-    2 degrees".
+    """Return the settings that differ between evaluations, such as "10 lights".
+
+    With noise: "all lights, light noise of 2 degrees".
     """
     noise = (
         f", light noise of {protocol.light_noise_deg:g} degrees" if protocol.light_noise_deg else ""
@@ -245,8 +249,9 @@ class Evaluation:
 
     @property
     def averages(self) -> dict[str, float]:
-        """Mean of mae_deg over the captures, by method. Every method has a result for every
-        capture.
+        """Mean of mae_deg over the captures, by method.
+
+        Every method has a result for every capture.
         """
         return {
             method: math.fsum(r.mae_deg for r in self.results if r.method == method)

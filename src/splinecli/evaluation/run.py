@@ -14,7 +14,7 @@ from threading import Lock
 from typing import Any, NamedTuple
 
 from splinecli._version import __version__
-from splinecli.capture import Capture, CaptureSource, capture_name, open_capture
+from splinecli.capture import Capture, CaptureOptions, CaptureSource, capture_name, open_capture
 from splinecli.capture.files import digest
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.estimate.methods import Estimator
@@ -245,7 +245,7 @@ def read_first_draw(
     `progress` is called with the fraction of the images just read. Raises InputError or UsageError
     if the capture cannot be read or scored.
     """
-    source = open_capture(folder, white_level=protocol.white_level)
+    source = open_capture(folder, CaptureOptions(white_level=protocol.white_level))
     protocol, draws_file = read_draws_file(protocol)
     trial = Trial(name, "", 0, draws_for(source, name, protocol, draws_file)[0], protocol, "")
     lights = range(protocol.skipped_lights(name), source.n_lights)

@@ -16,10 +16,10 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.errors import printable
 from splinecli.evaluation.protocol import Evaluation, heading, lights_value, protocol_in_words
+from splinecli.maths import Float64Array
 from splinecli.records.documents import ComparisonReport
 
 AVERAGE = "average"  # used instead of a capture's name for the average over all captures
@@ -28,8 +28,7 @@ _SAME_DEG = 1e-6  # error maps are float32, so MAEs closer than this are conside
 
 
 def compare(evaluation: Evaluation) -> list[ComparisonReport]:
-    """Return the comparison of every pair of methods on every capture, then on the average over the
-    captures.
+    """Compare every pair of methods on every capture, then on the average over the captures.
 
     Trial t of the average is the mean of trial t over the captures. See trial_averages.
     """
@@ -60,7 +59,7 @@ def trial_averages(evaluation: Evaluation, method: str) -> tuple[float, ...]:
     return tuple(float(np.mean(trial)) for trial in zip(*repeated, strict=False))
 
 
-def in_words(c: ComparisonReport) -> str:
+def comparison_in_words(c: ComparisonReport) -> str:
     """Return a sentence that describes a comparison."""
     better, worse = (c.first, c.second) if c.difference_deg < 0 else (c.second, c.first)
     size = f"{abs(c.difference_deg):.2f} degrees"
@@ -115,9 +114,7 @@ def _compare_all(maes_deg: dict[str, tuple[float, ...]], **settings: Any) -> lis
     return compared
 
 
-def _paired_test(
-    differences: NDArray[np.float64],
-) -> tuple[tuple[float, float] | None, float | None]:
+def _paired_test(differences: Float64Array) -> tuple[tuple[float, float] | None, float | None]:
     """Return the 95 % interval and the p-value of a t-test of differences (T,) against zero."""
     if len(differences) > 1 and np.abs(differences).max() < _SAME_DEG:
         return (0.0, 0.0), 1.0
@@ -154,8 +151,9 @@ _LATEX = str.maketrans(
 
 
 def table_rows(evaluation: Evaluation) -> list[list[str]]:
-    """Return a header row, then a row for each method: name, MAE on each capture, average; with two
-    decimals.
+    """Return a header row, then a row for each method: name, MAE on each capture, and average.
+
+    The errors have two decimals.
     """
     mae_deg = {(result.method, result.capture): result.mae_deg for result in evaluation.results}
     rows = [["method", *(printable(name) for name in evaluation.captures), AVERAGE]]
@@ -166,8 +164,9 @@ def table_rows(evaluation: Evaluation) -> list[list[str]]:
 
 
 def best_cells(rows: Sequence[Sequence[str]]) -> set[tuple[int, int]]:
-    """Return the (row, column) of the smallest printed values in each column; empty for a single
-    method.
+    """Return the (row, column) of the smallest printed values in each column.
+
+    The set is empty for a single method.
     """
     best = set()
     if len(rows) > 2:
@@ -180,9 +179,7 @@ def best_cells(rows: Sequence[Sequence[str]]) -> set[tuple[int, int]]:
 
 
 def caption(evaluation: Evaluation) -> str:
-    """Return a table's caption, with the protocol: "Mean angular error in degrees: 10 lights,
-    ...".
-    """
+    """Return a table's caption: "Mean angular error in degrees: 10 lights, ..."."""
     return f"Mean angular error in degrees: {protocol_in_words(evaluation.protocol)}."
 
 

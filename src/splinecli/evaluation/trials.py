@@ -18,7 +18,7 @@ from msgspec import MsgspecError, Struct, structs
 from msgspec import json as msgspec_json
 from numpy.typing import NDArray
 
-from splinecli.capture import Capture, CaptureSource, open_capture
+from splinecli.capture import Capture, CaptureOptions, CaptureSource, open_capture
 from splinecli.capture.record import in_one_plane
 from splinecli.errors import InputError
 from splinecli.estimate.inference import estimate_normals, find_surface
@@ -319,7 +319,7 @@ class CaptureReading:
 def open_to_score(folder: Path, protocol: Protocol) -> CaptureSource:
     """Open a capture under a protocol. Raises InputError, UsageError."""
     try:
-        return open_capture(folder, white_level=protocol.white_level)
+        return open_capture(folder, CaptureOptions(white_level=protocol.white_level))
     except OSError as error:
         raise as_splinecli_error(error, folder) from error
 

@@ -25,7 +25,7 @@ Lights = Float64Array | Callable[[Integers], Float64Array]
 
 # Each light adds an unknown. Four observations fit any intensities, and with five lights half of
 # the estimates are wrong.
-MIN_LIGHTS = 6
+FEWEST_FOR_INTENSITIES = 6
 # Normals with a smaller spread (their second largest standard deviation) belong to a flat object,
 # such as a coin or a painting. Tilting all its normals together has the same effect as other
 # intensities, so the likeliest tilt is used.
@@ -52,11 +52,11 @@ def estimate_light_intensities(
     Ball and 2.9 % on Cat; of six, it is 4 and 7 %; of equal ones, it would be 46 %.
     """
     n_lights = observations.shape[1]
-    if n_lights < MIN_LIGHTS:
+    if n_lights < FEWEST_FOR_INTENSITIES:
         return None
     rows, values = lit_values(observations, 0.1, min(2000, 100_000 // n_lights))
     known = np.ones(values.shape, np.bool_) if missing is None else ~missing[rows]
-    enough = known.sum(axis=1) >= MIN_LIGHTS
+    enough = known.sum(axis=1) >= FEWEST_FOR_INTENSITIES
     if enough.sum() < 100:
         return None
     rows, values, known = rows[enough], values[enough], known[enough]

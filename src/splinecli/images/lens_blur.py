@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.maths import Bools, Float32Array, Float64Array
+from splinecli.maths.pixel_grid import bounds
 
 # pixels around the object that the filter mixes with it, and half of the filter's side minus one
 REACH = 6
@@ -63,9 +64,7 @@ def surroundings(mask: Bools) -> Bools:
 def _grown(mask: Bools, reach: int) -> Bools:
     import cv2
 
-    return np.asarray(
-        cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
-    )
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
 
 
 def remove_blur(observations: Float32Array, mask: Bools, around: Bools) -> float | None:
@@ -121,10 +120,7 @@ def _widest_at(correlation: float) -> float:
     """
     sigmas = np.linspace(0.05, 2, 200)
     # of the values, at one and two pixels
-    one, two = (
-        np.exp(-1 / (4 * sigmas**2)),
-        np.exp(-1 / sigmas**2),
-    )
+    one, two = np.exp(-1 / (4 * sigmas**2)), np.exp(-1 / sigmas**2)
     of_gradients = (2 * one - 1 - two) / (2 - 2 * one)
     return float(np.interp(correlation + 0.1, of_gradients, sigmas))
 
@@ -236,8 +232,8 @@ def _looked_at(mask: Bools, region: Bools) -> list[tuple[slice, slice]]:
 
 def _box(mask: Bools, margin: int) -> tuple[slice, slice]:
     """Return the part (y, x) of an image that holds a mask (H, W) and as many pixels around it."""
-    y, x = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    return (
-        slice(max(int(y[0]) - margin, 0), int(y[-1]) + margin + 1),
-        slice(max(int(x[0]) - margin, 0), int(x[-1]) + margin + 1),
+    y, x = (
+        slice(max(first - margin, 0), last + margin + 1)
+        for first, last in (side.tolist() for side in bounds(mask))
     )
+    return y, x

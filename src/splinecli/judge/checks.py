@@ -12,10 +12,10 @@ from splinecli.capture import Capture
 from splinecli.capture.source import Source
 from splinecli.errors import InputError
 from splinecli.images.lamps import estimate_light_intensities
-from splinecli.judge.capture_sample import CaptureSample
+from splinecli.judge.evidence import Evidence
+from splinecli.judge.explanations import LIKELY, SRGB_EXPONENT, Explanation, Kind
 from splinecli.judge.light_check import LightCheck, light_warnings
 from splinecli.judge.odd_images import check_ground_truth
-from splinecli.judge.readings import LIKELY, SRGB_EXPONENT, Kind, Reading
 from splinecli.judge.summary import leave_out_background
 from splinecli.lights.light_fit import would_refine
 from splinecli.lights.rough_normals import median_turn_deg
@@ -33,7 +33,7 @@ DECISIVE = 0.35
 _MOST_NAMED = 4  # shifted images in a sentence
 
 
-def shifted_images(seen: CaptureSample) -> Iterator[CaptureWarning]:
+def shifted_images(seen: Evidence) -> Iterator[CaptureWarning]:
     shifts, names = seen.shifts, seen.names
     if not shifts:
         return
@@ -48,7 +48,7 @@ def shifted_images(seen: CaptureSample) -> Iterator[CaptureWarning]:
     yield CaptureWarning(codes.IMAGES_SHIFTED, text, seen.shift_error_deg)
 
 
-def other_scale(seen: CaptureSample) -> Iterator[CaptureWarning]:
+def other_scale(seen: Evidence) -> Iterator[CaptureWarning]:
     """Warn of an image with the values of a camera of fewer bits than the files of the others."""
     values, lights = np.asarray(seen.observations, np.float64), seen.directions
     # one image may be much brighter
@@ -78,7 +78,7 @@ def other_scale(seen: CaptureSample) -> Iterator[CaptureWarning]:
         )
 
 
-def odd_image(seen: CaptureSample) -> list[CaptureWarning]:
+def odd_image(seen: Evidence) -> list[CaptureWarning]:
     """Warn of an image that contradicts the others, and is not only shifted."""
     for name, largest in zip(seen.names, seen.sample.observations.max(axis=0), strict=True):
         if largest <= 0:
@@ -108,7 +108,7 @@ def odd_image(seen: CaptureSample) -> list[CaptureWarning]:
     return [CaptureWarning(codes.IMAGE_INCONSISTENT, text, _turn_by_deg(seen, [odd.place]))]
 
 
-def _turn_by_deg(seen: CaptureSample, places: list[int]) -> float | None:
+def _turn_by_deg(seen: Evidence, places: list[int]) -> float | None:
     """Return by how many degrees images change the normals found from the others; None with too few
     others.
     """
@@ -119,7 +119,7 @@ def _turn_by_deg(seen: CaptureSample, places: list[int]) -> float | None:
     return median_turn_deg(observations, lights, lights[others], observations[:, others])
 
 
-def missing_mask(seen: CaptureSample) -> Iterator[CaptureWarning]:
+def missing_mask(seen: Evidence) -> Iterator[CaptureWarning]:
     if seen.background > 0.5:  # the share of near black pixels
         text = (
             f"{100 * seen.background:.0f} % of the pixels are nearly black. If they are"
@@ -129,7 +129,7 @@ def missing_mask(seen: CaptureSample) -> Iterator[CaptureWarning]:
         yield CaptureWarning(codes.NO_MASK, text)
 
 
-def crowded_lights(seen: CaptureSample) -> Iterator[CaptureWarning]:
+def crowded_lights(seen: Evidence) -> Iterator[CaptureWarning]:
     spread, in_cone = light_spread(seen.directions)
     if spread < 0.1:  # see light_spread; such lights determine the normals poorly
         where = "in a narrow cone" if in_cone else "nearly in one plane with the object"
@@ -141,7 +141,7 @@ def crowded_lights(seen: CaptureSample) -> Iterator[CaptureWarning]:
         yield CaptureWarning(codes.LIGHTS_ILL_CONDITIONED, text)
 
 
-def same_images(seen: CaptureSample) -> Iterator[CaptureWarning]:
+def same_images(seen: Evidence) -> Iterator[CaptureWarning]:
     pairs = sorted({*repeated_images(seen.sample.observations), *seen.copies})
     differ = "" if seen.found else ", but their lights differ"
     if differ:
@@ -161,7 +161,7 @@ def same_images(seen: CaptureSample) -> Iterator[CaptureWarning]:
         yield CaptureWarning(codes.REPEATED_IMAGES, text, max(errors_deg, default=None))
 
 
-def rough_lights(seen: CaptureSample) -> list[CaptureWarning]:
+def rough_lights(seen: Evidence) -> list[CaptureWarning]:
     """Suggest refining the lights if this makes them fit much better."""
     if (
         seen.has_positions
@@ -177,8 +177,8 @@ def rough_lights(seen: CaptureSample) -> list[CaptureWarning]:
     return [CaptureWarning(codes.ROUGH_LIGHTS, text)]
 
 
-def other_readings(seen: CaptureSample, largest_ratio: float = 1.0) -> list[CaptureWarning]:
-    """Warn of images that fit much better if they are read in another way; see readings.py.
+def other_readings(seen: Evidence, largest_ratio: float = 1.0) -> list[CaptureWarning]:
+    """Warn of images that fit much better if they are read in another way; see explanations.py.
 
     Readings that leave more than the largest ratio of the residual are not named.
     """
@@ -191,7 +191,7 @@ def other_readings(seen: CaptureSample, largest_ratio: float = 1.0) -> list[Capt
         observations = np.asarray(seen.observations, np.float32)
         if estimate_light_intensities(observations, None, seen.directions) is not None:
             return []  # `infer` estimates them, and reports it
-    error_deg = seen.readings.error_deg(reading, seen.estimated)
+    error_deg = seen.explanations.error_deg(reading, seen.estimated)
     left = f"the residual falls to {100 * reading.ratio:.0f} %"
     if seen.doubt.others:
         causes = " and ".join(_CAUSES[kind] for kind in seen.doubt.others)
@@ -235,7 +235,7 @@ _CAUSES: dict[Kind, str] = {
 }
 
 
-def _intensities_text(seen: CaptureSample, reading: Reading, left: str) -> str:
+def _intensities_text(seen: Evidence, reading: Explanation, left: str) -> str:
     given = seen.intensities
     if given is None:
         return (
@@ -265,7 +265,7 @@ def _intensities_text(seen: CaptureSample, reading: Reading, left: str) -> str:
     )
 
 
-def few_lights(seen: CaptureSample) -> list[CaptureWarning]:
+def few_lights(seen: Evidence) -> list[CaptureWarning]:
     """Warn of fewer lights than eight, unless they are channels: one colour image has three."""
     count = len(seen.names)
     few = count < 8 and not seen.in_channels
@@ -274,7 +274,7 @@ def few_lights(seen: CaptureSample) -> list[CaptureWarning]:
     ] * few
 
 
-def lights_near_axis(seen: CaptureSample) -> list[CaptureWarning]:
+def lights_near_axis(seen: Evidence) -> list[CaptureWarning]:
     """Warn of lights that all shine from near the camera."""
     if np.degrees(np.arccos(seen.directions[:, 2].clip(-1, 1))).max() >= 25:
         return []
@@ -301,7 +301,7 @@ READ_OTHERWISE = frozenset(
 class Check:
     """A row of CHECKS."""
 
-    find: Callable[[CaptureSample], Iterable[CaptureWarning]]
+    find: Callable[[Evidence], Iterable[CaptureWarning]]
     unless: frozenset[WarningKind] = frozenset()  # earlier warnings after which it is skipped
     needs_lights: bool = True  # whether it is skipped if the lights were estimated from the images
 
@@ -347,14 +347,8 @@ def check_capture(source: Source, capture: Capture, *, strict: bool = False) -> 
         >>> check_capture(source, prepare_capture(source)).warnings
         ()
     """
-    light_check, warnings = check_sample(CaptureSample.of(source, capture, strict=strict))
-    return Judgement(tuple(warnings), light_check)
-
-
-def check_sample(seen: CaptureSample) -> tuple[LightCheck | None, list[CaptureWarning]]:
-    """Return the light check of images without dark background (None if the lights were estimated),
-    and warnings.
-    """
+    seen = Evidence.of(source, capture, strict=strict)
+    # without dark background
     (sample, background), (closeup, _) = (
         leave_out_background(seen.sample),
         leave_out_background(seen.closeup),
@@ -366,7 +360,7 @@ def check_sample(seen: CaptureSample) -> tuple[LightCheck | None, list[CaptureWa
             each.kind for each in warnings
         ):
             warnings += check.find(seen)
-    return None if seen.found else seen.light_check, warnings
+    return Judgement(tuple(warnings), None if seen.found else seen.light_check)
 
 
 def light_spread(light_directions: Float64Array) -> tuple[float, bool]:

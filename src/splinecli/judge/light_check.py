@@ -15,7 +15,7 @@ import numpy as np
 
 from splinecli.capture.light_rows import BOTH_NEGATED, PLANE_FRAMES, LightFrame
 from splinecli.judge.light_order import (
-    FEWEST_LIGHTS,
+    FEWEST_TO_ORDER,
     HALF_LEFT,
     HALF_VECTORS,
     LARGEST_MENDED,
@@ -90,7 +90,7 @@ class LightCheck:
         missing = []
         if np.isnan(self.given_misfit):
             missing.append(
-                f"their order (fewer than {FEWEST_LIGHTS} lights, too few lit pixels, or a flat"
+                f"their order (fewer than {FEWEST_TO_ORDER} lights, too few lit pixels, or a flat"
                 " object)"
             )
         if self.order == UNKNOWN_ORDER or self.best is not None:
@@ -253,13 +253,12 @@ def _by_shadows(
     Also return whether shadows exclude the given lights with x and y negated, and whether the given
     lights lack some.
     """
-    shadows, best = check.shadows(given.matrix), max(judged, key=lambda other: other.advantage)
-    told = {}
+    best, told = max(judged, key=lambda other: other.advantage), {}
+    shadows, of_negated = check.shadows(given.matrix)
     for one in (given, best):
         twin = _negated(judged, one)
         if twin is not None and (one is given or one.advantage >= 1):
-            found = shadows if one is given else check.shadows(one.matrix)
-            told[twin.name] = found, check.shadows(twin.matrix)
+            told[twin.name] = (shadows, of_negated) if one is given else check.shadows(one.matrix)
     judged = [
         replace(
             other, advantage=other.advantage + told[other.name][0].evidence(told[other.name][1])
@@ -268,8 +267,8 @@ def _by_shadows(
         else other
         for other in judged
     ]
-    both = next(other for name, (_, other) in told.items() if name == BOTH_NEGATED.describe())
-    return judged, shadows.evidence(both) < -_TOLD_APART, shadows.leaves_open(both)
+    excluded = shadows.evidence(of_negated) < -_TOLD_APART
+    return judged, excluded, shadows.leaves_open(of_negated)
 
 
 def _negated(candidates: Iterable[Candidate], one: Candidate) -> Candidate | None:

@@ -30,7 +30,7 @@ from splinecli.maths import Bools, Float64Array, Floats, Integers
 from splinecli.maths.normals import unit
 from splinecli.maths.robust import absolute_weights, fit_robustly, lit_values, shadow_weights
 
-FEWEST_LIGHTS = 6  # fewer leave too few equations for the order
+FEWEST_TO_ORDER = 6  # fewer leave too few equations for the order
 HALF_LEFT = 0.6  # half vectors: doubled angles leave at most this share of the residual
 LARGEST_MENDED = 0.35  # residual of a better order; right lights of most metals have less
 # Residuals are shares of the median residual of random orders.
@@ -195,7 +195,7 @@ def _readings(given: Float64Array) -> Iterator[tuple[str, Float64Array]]:
             yield " and ".join(filter(None, (way, shift))), directions
 
 
-class Turn(NamedTuple):
+class FittingShift(NamedTuple):
     """A shift of the lights that fits as well: in words, its steps, and the matrix (3, 3) that
     takes lights there.
     """
@@ -217,10 +217,11 @@ class LightOrder:
     given_misfit: float = np.nan  # as a share of random orders'; NaN with too few lights
     misfit: float = np.nan  # the same for this order
     plausible: bool = True  # whether the lights fit well enough for the normals to show an outline
-    tried: tuple[
-        tuple[str, float], ...
-    ] = ()  # readings in words, each with its residual as a share of random orders'
-    turns: tuple[Turn, ...] = ()  # shifts that fit as well. They rotate a regular ring of lights
+    # readings in words, each with its residual as a share of random orders'
+    tried: tuple[tuple[str, float], ...] = ()
+    turns: tuple[
+        FittingShift, ...
+    ] = ()  # shifts that fit as well. They rotate a regular ring of lights
 
 
 class _Reading(NamedTuple):
@@ -248,7 +249,7 @@ def check_order(
     """
     lights, n_all = light_directions[chosen], len(light_directions)
     unknown = LightOrder(None, lights, np.ones(len(lights)))
-    if factors is None or len(lights) < FEWEST_LIGHTS:
+    if factors is None or len(lights) < FEWEST_TO_ORDER:
         return unknown
     compared, random = _free_if_possible(factors, lights)
     usual = max(float(np.median(random)), 1e-9)
@@ -267,37 +268,27 @@ def check_order(
         _best_exchange(compared, lights, names),
         reading(ZENITH, zenith_as_elevation(lights)),
     )
-    tried, found, share = [*shifts, exchanged, of_angles], given, given.misfit / usual
+    tried, share = [*shifts, exchanged, of_angles], given.misfit / usual
     doubled = lights_of_half_vectors(lights)
     # Half vectors of lights above the horizon are within 45 degrees of the axis.
     if doubled[:, 2].min() > 0.0:
         tried.append(reading(HALF_VECTORS, doubled))
-    # A better order leaves at most this share of the given residual, which is less for few lights.
-    limit = min(given.misfit * (0.4 if len(lights) <= 8 else 0.6), LARGEST_MENDED * usual)
-    best = min((*shifts, of_angles), key=lambda reading: reading.misfit)
     if tried[-1].words == HALF_VECTORS and _are_half_vectors(
         observations, factors, lights, doubled
     ):
         found = tried[-1]
-    elif share > 0.25 and best.misfit < limit:  # a wrong order has a larger residual
-        found = best
-    elif share > 0.08 and exchanged.misfit < limit:  # where two lights are exchanged
-        found = exchanged
-    if (
-        found.words != HALF_VECTORS
-        and found.misfit > 0.1 * usual
-        and np.array_equal(chosen, np.arange(n_all))
-    ):
-        rings = _Reading(*mend_rings(compared, lights))
-        if rings.words:
-            tried.append(rings)
-            if rings.misfit < min(found.misfit * 0.75, LARGEST_MENDED * usual):
+    else:
+        found = _better(given, [*shifts, of_angles], exchanged, usual)
+        if found.misfit > 0.1 * usual and np.array_equal(chosen, np.arange(n_all)):
+            rings = _Reading(*mend_rings(compared, lights))
+            tried += [rings] if rings.words else []
+            if rings.words and rings.misfit < min(found.misfit * 0.75, LARGEST_MENDED * usual):
                 found = rings
     # On glossy plates, free intensities hide an order that fits well under the known ones.
     fits_known = factors.intensities_known and _is_plausible(factors, given, usual)
     if found is given and not fits_known and _is_wrong(observations, compared, given, random):
         found = given._replace(words=UNKNOWN_ORDER)
-    turns: tuple[Turn, ...] = ()
+    turns: tuple[FittingShift, ...] = ()
     if any(found is shift for shift in shifts) or (found is given and share < 0.25):
         turns = _turns(found.lights, shifted, misfits <= max(1.3 * found.misfit, 0.05 * usual))
     return LightOrder(
@@ -310,6 +301,21 @@ def check_order(
         tuple((str(reading.words), reading.misfit / usual) for reading in tried),
         turns,
     )
+
+
+def _better(
+    given: _Reading, others: Sequence[_Reading], exchanged: _Reading, usual: float
+) -> _Reading:
+    """Return the reading that fits clearly better than the given one, or the given one."""
+    share = given.misfit / usual
+    # A better order leaves at most this share of the given residual, which is less for few lights.
+    limit = min(given.misfit * (0.4 if len(given.lights) <= 8 else 0.6), LARGEST_MENDED * usual)
+    best = min(others, key=lambda reading: reading.misfit)
+    if share > 0.25 and best.misfit < limit:  # a wrong order has a larger residual
+        return best
+    if share > 0.08 and exchanged.misfit < limit:  # where two lights are exchanged
+        return exchanged
+    return given
 
 
 def _are_half_vectors(
@@ -415,7 +421,7 @@ def _fits_like_random(observations: Floats, factors: Factors, lights: Float64Arr
     return given > 0.7 * float(np.median(random))
 
 
-def _turns(lights: Float64Array, shifted: Float64Array, fitting: Bools) -> tuple[Turn, ...]:
+def _turns(lights: Float64Array, shifted: Float64Array, fitting: Bools) -> tuple[FittingShift, ...]:
     """Return the fitting ones of shifted orders (2 N, F, 3), but not those that leave the lights
     (F, 3) in place.
     """
@@ -424,7 +430,9 @@ def _turns(lights: Float64Array, shifted: Float64Array, fitting: Bools) -> tuple
     for row in np.flatnonzero(fitting).tolist():
         matrix = (inverse @ shifted[row]).T
         if not np.allclose(matrix, np.eye(3), atol=1e-6):
-            turns.append(Turn(_shift_words(row, n_all), min(row % n_all, -row % n_all), matrix))
+            turns.append(
+                FittingShift(_shift_words(row, n_all), min(row % n_all, -row % n_all), matrix)
+            )
     return tuple(turns)
 
 

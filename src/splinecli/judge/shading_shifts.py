@@ -7,10 +7,13 @@ direction or intensity is not mistaken for a shift: on a ball, moved shading and
 only near the outline and by the shadow.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splinecli.capture.sample import Sample
 from splinecli.maths import Bools, Float64Array
@@ -26,8 +29,13 @@ _DARK, _HIGHLIGHT = (
     (1.15, 0.05),
 )
 _PASSES, _FITS = 2, 5
+Complex128Array = NDArray[np.complex128]
 Shift = tuple[int, int]  # right, down
 _NO_SHIFT = 0.0, (0, 0)
+# The residual of a shifted image is so many times the lower quartile of the images' residuals. If
+# the model fits no image well, as on polished balls, it does not show which is shifted. Metals
+# leave more than the second.
+_UNUSUAL, _LARGEST = 2.0, 0.6
 
 
 def shading_shifts(sample: Sample, light_directions: Float64Array) -> dict[int, Shift]:
@@ -41,7 +49,8 @@ def shading_shifts(sample: Sample, light_directions: Float64Array) -> dict[int, 
         return {}
     images = np.zeros((len(light_directions), *sample.mask.shape))
     images[:, sample.mask] = sample.observations.T
-    model = _MatteModel(images[:, ::stride, ::stride], mask, light_directions)
+    images, mask = _cropped(images[:, ::stride, ::stride], mask)
+    model = _MatteModel(images, mask, light_directions)
     n_images = len(images)
     halves = (range(n_images // 2), range(0, n_images, 2)) if n_images >= _MANY_IMAGES else ()
     together = []
@@ -69,6 +78,11 @@ def shading_shifts(sample: Sample, light_directions: Float64Array) -> dict[int, 
     return {place: (stride * right, stride * down) for place, (right, down) in model.shifts.items()}
 
 
+def _cropped(images: Float64Array, mask: Bools) -> tuple[Float64Array, Bools]:
+    rows, columns = (slice(places.min(), places.max() + 1) for places in np.nonzero(mask))
+    return images[:, rows, columns], mask[rows, columns]
+
+
 def moved_back(sample: Sample, shifts: Mapping[int, Shift]) -> tuple[Bools, Float64Array]:
     """Return which pixels (P,) all images show, moved back by shifts in pixels of the sample, and
     all values (P, F).
@@ -85,14 +99,112 @@ def moved_back(sample: Sample, shifts: Mapping[int, Shift]) -> tuple[Bools, Floa
     return known, values
 
 
-class _Compared(NamedTuple):
-    """Residuals of an image at all shifts (h, w), and without a shift in the same pixels, and their
-    components.
+class _Compared:
+    """How a matte model fits an image: unmoved, and at all shifts, in shares of its brightness.
+
+    Args:
+        scaled: (3, H, W), scaled normals that were fitted without the image.
+        good: (H, W), 1 where they are known; else 0.
+        kept: (H, W), 1 in the pixels of the image that count; else 0.
+        image: (H, W), zero elsewhere.
     """
 
-    left: Float64Array
-    unmoved: Float64Array
-    maps: tuple[Float64Array, Float64Array, Float64Array, Float64Array]
+    def __init__(
+        self,
+        scaled: Float64Array,
+        good: Float64Array,
+        kept: Float64Array,
+        image: Float64Array,
+        sums: _ShiftedSums,
+    ) -> None:
+        self.maps, self._sums = (scaled, good, kept, image), sums
+        self._brightness = max(float(np.sqrt((image**2).sum() / kept.sum())), 1e-12)
+        inside = (good * kept) > 0
+        count = np.array(float(np.count_nonzero(inside)))
+        seen, own = scaled[:, inside], image[inside]
+        products, squares = (seen @ seen.T)[np.triu_indices(3)], own @ own
+        self.still = float(_residual(count, products, seen @ own, squares)) / self._brightness
+        if count <= 0.5 * min(good.sum(), kept.sum()):  # the overlap may be too small
+            self.still = float(self.left[sums.reach, sums.reach])
+        self._count = float(count)
+
+    @cached_property
+    def _enough(self) -> Bools:
+        _, good, kept, _ = self.maps
+        overlap = self._sums.of(good, kept)
+        return np.asarray(overlap > 0.5 * overlap.max())
+
+    @cached_property
+    def _products(self) -> Float64Array:
+        scaled = self.maps[0]
+        return np.stack([scaled[i] * scaled[j] for i, j in zip(*np.triu_indices(3), strict=True)])
+
+    @cached_property
+    def left(self) -> Float64Array:
+        """The residuals (h, w) of the image at all shifts; infinite where too little overlaps."""
+        scaled, good, kept, image = self.maps
+        mask_sums = self._sums.of(np.concatenate((good[None], self._products)), kept)
+        sums = self._sums.of(scaled, image), self._sums.of(good, image**2)
+        return self._shares(mask_sums, *sums)
+
+    @cached_property
+    def unmoved(self) -> Float64Array:
+        """The residuals (h, w) without a shift, in the pixels that the moved image covers."""
+        scaled, good, kept, image = self.maps
+        terms = good[None], self._products, scaled * image, (good * image**2)[None]
+        found = self._sums.of_mask(np.concatenate((kept * terms[0], kept * terms[1], *terms[2:])))
+        return self._shares(found[:7], found[7:10], found[10])
+
+    def _shares(
+        self, of_normals: Float64Array, of_image: Float64Array, squares: Float64Array
+    ) -> Float64Array:
+        found = _residual(of_normals[0], of_normals[1:], of_image, squares)
+        return np.where(self._enough, found / self._brightness, np.inf)
+
+    def may_leave(self, most_left: float) -> Bools:
+        """Return which shifts (h, w) may leave at most this share of the residual."""
+        return np.asarray(self.left <= most_left * (1 + 1e-6) * self.most_unmoved)  # for rounding
+
+    @cached_property
+    def most_unmoved(self) -> Float64Array:
+        """What `unmoved` does not exceed: fewer pixels have at most the same sum of squares."""
+        _, good, kept, _ = self.maps
+        count = np.maximum(self._sums.of_mask((good * kept)[None])[0], 1)
+        return np.asarray(self.still * np.sqrt(self._count / count))
+
+
+class _ShiftedSums:
+    """Sums over the pixels x of first(x) second(x + shift), at all shifts (down, right) within
+    reach, by Fourier transforms.
+    """
+
+    def __init__(self, mask: Bools, reach: int) -> None:
+        from scipy.fft import next_fast_len
+
+        self.reach = reach
+        self._shape = [next_fast_len(side + reach, real=True) for side in mask.shape]
+        self._around = np.arange(-reach, reach + 1)
+        self._mask = self._transformed(mask.astype(np.float64))
+
+    def of(self, first: Float64Array, second: Float64Array) -> Float64Array:
+        """Return the sums (..., h, w) of maps (..., H, W) and one map (H, W)."""
+        return self._sums(first, self._transformed(second))
+
+    def of_mask(self, first: Float64Array) -> Float64Array:
+        """Return the sums (..., h, w) of maps (..., H, W) and the mask."""
+        return self._sums(first, self._mask)
+
+    def _sums(self, first: Float64Array, second: Complex128Array) -> Float64Array:
+        from scipy.fft import ifft, irfft
+
+        rows = ifft(np.conj(self._transformed(first)) * second, axis=-2, overwrite_x=True)
+        near = irfft(rows[..., self._around, :], self._shape[1], axis=-1)
+        return np.asarray(near[..., self._around])
+
+    def _transformed(self, maps: Float64Array) -> Complex128Array:
+        from scipy.fft import fft, rfft
+
+        return np.asarray(fft(rfft(maps, self._shape[1]), self._shape[0], axis=-2))
 
 
 class _MatteModel:
@@ -108,10 +220,10 @@ class _MatteModel:
         self.images, self.mask, self.lights = images, mask, light_directions
         self.shifts: dict[int, Shift] = {}
         self._found: dict[int, _Compared | None] = {}  # of this fit
-        # Shifts are compared up to this share of the smaller side of the object.
-        self.reach = max(
-            2, round(0.2 * min(int(np.ptp(places)) + 1 for places in np.nonzero(mask)))
-        )
+        # Shifts are compared up to this share of the smaller side of the object. Wrong models often
+        # keep improving towards larger shifts.
+        reach = max(2, round(0.2 * min(int(np.ptp(places)) + 1 for places in np.nonzero(mask))))
+        self._sums = _ShiftedSums(mask, int(0.75 * reach))
         self._values = images[:, mask].T.copy()
         self._known = np.zeros(self._values.shape, np.bool_)
         self._known[:, slice(None) if fitted is None else list(fitted)] = True
@@ -173,34 +285,12 @@ class _MatteModel:
             self._map(np.asarray(normals.any(axis=1))),
             self._map(normals * self._top[:, None]),
         )
-        kept, image = self._map(kept), self._map(image * kept)
-        products = np.stack(
-            [scaled[row] * scaled[column] for row, column in zip(*np.triu_indices(3), strict=True)]
-        )
-        overlap = self._sums(good, kept)
-        left = _residual(
-            overlap,
-            self._sums(products, kept),
-            self._sums(scaled, image),
-            self._sums(good, image**2),
-        )
-        unmoved = _residual(  # in the pixels that the moved image covers
-            self._sums(good * kept, self.mask),
-            self._sums(products * kept, self.mask),
-            self._sums(scaled * image, self.mask),
-            self._sums(good * image**2, self.mask),
-        )
-        brightness = max(float(np.sqrt((image**2).sum() / kept.sum())), 1e-12)
-        enough = overlap > 0.5 * overlap.max()
-        left, unmoved = (
-            np.where(enough, values / brightness, np.inf) for values in (left, unmoved)
-        )
-        return _Compared(left, unmoved, (scaled, good, kept, image))
+        return _Compared(scaled, good, self._map(kept), self._map(image * kept), self._sums)
 
     def usual_residual(self, places: Sequence[int]) -> float:
         """Return the lower quartile of the residuals of some images in their current positions."""
         found = [compared for compared in map(self._compared, places) if compared is not None]
-        still = [compared.left[self.reach, self.reach] for compared in found]
+        still = [compared.still for compared in found]
         return float(np.quantile(still, 0.25)) if still else np.inf
 
     def find(self, place: int, usual: float) -> tuple[float, Shift]:
@@ -212,6 +302,11 @@ class _MatteModel:
             return _NO_SHIFT
         # Gloss on a rendered sphere under eight lights reached 0.4.
         most_left = _LEFT if len(self.images) >= _MANY_IMAGES else 0.35
+        if not (
+            _may_be_moved(compared.most_unmoved, 0.03, usual)
+            and compared.may_leave(most_left).any()
+        ):
+            return _NO_SHIFT
         fall, shift = _least(compared.left, compared.unmoved, 0.03, most_left, usual)
         return (
             (fall, shift)
@@ -224,13 +319,21 @@ class _MatteModel:
         found = [compared for compared in map(self._compared, places) if compared is not None]
         if len(found) < len(places) / 2:
             return _NO_SHIFT
+        most = np.median([each.most_unmoved for each in found], axis=0)
+        if not _may_be_moved(most, 0.02, usual):
+            return _NO_SHIFT
+        most_left, fitting = 0.6, np.full(most.shape, len(found))
+        for each in found:  # until no shift can fit half of the images
+            fitting -= ~each.may_leave(most_left)
+            if fitting.max() < len(found) / 2:
+                return _NO_SHIFT
         with np.errstate(
             invalid="ignore", divide="ignore"
         ):  # medians, so that one shifted image does not decide
             shares = np.median([each.left / each.unmoved for each in found], axis=0)
         unmoved = np.median([each.unmoved for each in found], axis=0)
         known = np.isfinite(shares) & np.isfinite(unmoved)
-        return _least(np.where(known, shares * unmoved, np.inf), unmoved, 0.02, 0.6, usual)
+        return _least(np.where(known, shares * unmoved, np.inf), unmoved, 0.02, most_left, usual)
 
     def _left_in_halves(
         self,
@@ -269,16 +372,14 @@ class _MatteModel:
         array[..., self.mask] = values.T
         return array
 
-    def _sums(self, first: Float64Array, second: Float64Array | Bools) -> Float64Array:
-        """Return the sums over pixels x of first(x) second(x + shift), at all shifts (down, right)
-        within reach.
-        """
-        from scipy.fft import irfft2, next_fast_len, rfft2
 
-        shape = [next_fast_len(side + self.reach, real=True) for side in self.mask.shape]
-        sums = irfft2(np.conj(rfft2(first, shape)) * rfft2(second, shape), shape)
-        around = np.arange(-self.reach, self.reach + 1)
-        return np.asarray(sums[..., around[:, None], around])
+def _may_be_moved(most_unmoved: Float64Array, least_fall: float, usual: float) -> bool:
+    """Return whether _least may accept a shift, from bounds (h, w) of the unmoved residuals.
+
+    This saves most of the Fourier transforms of a still capture.
+    """
+    most = most_unmoved.max() * (1 + 1e-6)  # for rounding
+    return bool(most >= max(least_fall, _UNUSUAL * usual) and _UNUSUAL * usual <= _LARGEST)
 
 
 def _least(
@@ -288,14 +389,10 @@ def _least(
     (h, w).
     """
     reach = len(left) // 2
-    around = np.abs(np.arange(-reach, reach + 1))
-    # Wrong models often keep improving towards the largest shifts.
-    near = np.maximum(around[:, None], around) <= 0.75 * reach
     with np.errstate(invalid="ignore"):
-        # The residual of a shifted image is so many times the lower quartile of the images'
-        # residuals. If the model fits no image well, as on polished balls, it does not show which
-        # is shifted. Metals leave more than 0.6.
-        counts = near & (unmoved - left >= least_fall) & (unmoved <= 0.6) & (unmoved >= 2.0 * usual)
+        counts = (
+            (unmoved - left >= least_fall) & (unmoved <= _LARGEST) & (unmoved >= _UNUSUAL * usual)
+        )
     shares = np.full(left.shape, np.inf)
     shares[counts] = left[counts] / unmoved[counts]
     row, column = np.unravel_index(int(shares.argmin()), shares.shape)

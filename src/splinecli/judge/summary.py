@@ -8,9 +8,7 @@ import numpy as np
 
 from splinecli.capture.sample import Sample
 from splinecli.errors import InputError
-from splinecli.images.saturation import (
-    find_object,
-)
+from splinecli.images.saturation import find_object
 from splinecli.maths import Bools, Floats
 
 MAX_PIXELS = 20_000  # larger captures are subsampled by 2, 3 and so on

@@ -27,9 +27,9 @@ def draw_lights(
     available = len(light_directions)
     check_draw_settings(n_lights, trials, seed)
     if n_lights is not None and n_lights > available:
-        hint = f"Use --n-lights {available}, or fewer"
         raise UsageError(
-            f"the capture has {available} lights, too few for draws of {n_lights}", hint=hint
+            f"the capture has {available} lights, too few for draws of {n_lights}",
+            hint=f"Use --n-lights {available}, or fewer",
         )
     if n_lights is None or n_lights == available:
         return [tuple(range(available))]
@@ -54,7 +54,7 @@ def _draw(light_directions: Float64Array, n_lights: int, trial: int, seed: int) 
         chosen = np.sort(np.argsort(generator.random(len(light_directions)))[:n_lights])
         if not in_one_plane(light_directions[chosen]):
             return tuple(chosen.tolist())
-    problem = f"all of 1000 draws of {n_lights} lights are in one plane"
     raise InputError(
-        problem, hint="Choose more lights, or lights that surround the viewing direction"
+        f"all of 1000 draws of {n_lights} lights are in one plane",
+        hint="Choose more lights, or lights that surround the viewing direction",
     )

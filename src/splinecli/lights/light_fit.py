@@ -32,7 +32,7 @@ from splinecli.records.capture_warnings import REFINED_LIGHTS, REFINEMENT_REJECT
 LIT_SHARE = 0.1  # observations below this share of a pixel's largest one are treated as shadow
 MIN_PIXELS_PER_LIGHT = 10
 LIGHT_ERROR_DEG, LARGEST_LIGHT_ERROR_DEG = 5.0, 30.0  # usual and largest error of a rough direction
-MIN_LIGHTS = 6  # with fewer lights, an error of a light looks like an error of the normals
+FEWEST_TO_REFINE = 6  # with fewer lights, an error of a light looks like an error of the normals
 INTENSITY_ERROR = 0.15  # standard deviation of unmeasured intensities, in the prior
 _MIN_PIXELS = 100
 _PRIOR = 1e-9
@@ -67,9 +67,13 @@ class Factors:
         """
         if self.intensities_known:
             return self.distances(np.linalg.qr(light_directions)[0])
-        intensities, matrices = self._fit_intensities(light_directions)
-        differences = self.matrix.T - intensities[..., None] * matrices
-        return np.asarray(np.sqrt((differences**2).sum(axis=(1, 2))))
+        found = []
+        # Parts that stay in the processor's cache save half of the time.
+        for part in np.array_split(light_directions, light_directions.size // 30_000 + 1):
+            intensities, matrices = self._fit_intensities(part)
+            differences = self.matrix.T - intensities[..., None] * matrices
+            found.append(np.sqrt((differences**2).sum(axis=(1, 2))))
+        return np.concatenate(found)
 
     def distances(self, bases: Float64Array) -> Float64Array:
         """Return the root mean square distances (N,) from the images that orthonormal bases (N, F,
@@ -225,8 +229,8 @@ def refine_capture(
     )
     if found is None:
         reason = "no directions near them fit the images much better"
-        if capture.n_lights < MIN_LIGHTS:
-            reason = f"there are fewer than {MIN_LIGHTS} lights"
+        if capture.n_lights < FEWEST_TO_REFINE:
+            reason = f"there are fewer than {FEWEST_TO_REFINE} lights"
         elif _choose_pixels(capture.observations) is None:
             reason = f"there are fewer than {_MIN_PIXELS} lit pixels"
         kept = CaptureWarning(
@@ -385,7 +389,7 @@ def _choose_pixels(observations: Float32Array) -> Float64Array | None:
     """Return observations (p, F) of lit pixels, each scaled to a largest value of 1; None for too
     few.
     """
-    if observations.shape[1] < MIN_LIGHTS:
+    if observations.shape[1] < FEWEST_TO_REFINE:
         return None
     _, values = lit_values(observations, 0.02, 2000)
     return values.clip(min=0) if len(values) >= _MIN_PIXELS else None

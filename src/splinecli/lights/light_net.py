@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import normalize, softplus
+from torch.nn.functional import interpolate, normalize, pad, softplus
 
 from splinecli.system.weight_files import SHIPPED, load_module
 
@@ -120,9 +120,9 @@ def square_images(images: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     side = max(height, width)
     top, left = (side - height) // 2, (side - width) // 2
     weighed = torch.cat((images[:, *box] * inside, inside[None]))
-    weighed = nn.functional.pad(weighed, (left, side - width - left, top, side - height - top))
+    weighed = pad(weighed, (left, side - width - left, top, side - height - top))
     mode = "area" if side > SIDE else "bilinear"
-    small = nn.functional.interpolate(weighed[None], (SIDE, SIDE), mode=mode)[0]
+    small = interpolate(weighed[None], (SIDE, SIDE), mode=mode)[0]
     share = small[-1]
     return small[:-1] / share.clamp(min=0.25), (share > 0.5).float()
 

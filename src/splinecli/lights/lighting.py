@@ -25,7 +25,7 @@ import numpy as np
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Integers
 from splinecli.maths.normals import unit
-from splinecli.maths.pixel_grid import Blocks, focal_length, ray_basis, rays_at
+from splinecli.maths.pixel_grid import Blocks, focal_length, on_map, ray_basis, rays_at
 from splinecli.surface.integration import integrate_normals
 from splinecli.system.machine import side_by_side
 
@@ -39,9 +39,8 @@ def surface_points(lamps: NearLamps, rows: Floats, columns: Floats, depth: Float
     """
     if lamps.camera_matrix is None:
         middle_row, middle_column = lamps.middle
-        points = (
-            np.stack((columns - middle_column, middle_row - rows, depth), axis=1) * lamps.pixel_size
-        )
+        points = np.stack((columns - middle_column, middle_row - rows, depth), axis=1)
+        points = points * lamps.pixel_size
     else:
         rays = rays_at(rows, columns, lamps.camera_matrix)
         points = rays * (depth * _plane_distance(lamps))[:, None] + _camera_position(lamps)
@@ -124,7 +123,7 @@ def _camera_position(lamps: NearLamps) -> Floats:
     assert lamps.camera_matrix is not None
     row, column = lamps.middle
     middle = np.array((column, row, 1.0)) @ ray_basis(lamps.camera_matrix)
-    return np.asarray(-middle * _plane_distance(lamps))
+    return -middle * _plane_distance(lamps)
 
 
 def _turns_to_view(views: Floats) -> Floats:
@@ -246,9 +245,7 @@ def _exchange(
     Occlusion between blocks is ignored. `covered` (p,) is the share of each block that the mask
     covers, `normals` (p, 3) are unit, and `sent` (p, F) is the radiance of each block.
     """
-    normal_map = np.zeros((*blocks.mask.shape, 3))
-    normal_map[blocks.mask] = normals
-    heights = integrate_normals(normal_map, blocks.mask)[blocks.mask]
+    heights = integrate_normals(on_map(normals, blocks.mask), blocks.mask)[blocks.mask]
     rows, columns = np.nonzero(blocks.mask)
     places = np.stack((columns, -rows, heights), axis=1)
     towards = (places - places[:, None]).astype(np.float32)
@@ -300,9 +297,8 @@ def _exposure(
     exposure = float(seen @ gathered / (gathered @ gathered))
     # If gathered and ambient light are more alike, they cannot be separated.
     if gathered @ albedo < 0.998 * np.linalg.norm(gathered) * np.linalg.norm(albedo):
-        with_ambient, ambient = np.linalg.lstsq(
-            np.stack((gathered, albedo), axis=1), seen, rcond=None
-        )[0]
+        design = np.stack((gathered, albedo), axis=1)
+        with_ambient, ambient = np.linalg.lstsq(design, seen, rcond=None)[0]
         exposure = float(with_ambient) if ambient > 0 else exposure
     return exposure if exposure > 0 else None
 

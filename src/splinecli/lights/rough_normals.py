@@ -261,15 +261,20 @@ class ShadowCheck:
         lit = shading > _LIT_SHARE * shading.max(axis=1, keepdims=True).clip(min=1e-12)
         return cls(coarse, lights[chosen], lit, lit & (values[:, chosen] < _DARK_SHARE * shading))
 
-    def shadows(self, matrix: Float64Array) -> Shadows:
-        """Return the shadows under the lights after a multiplication with a matrix (3, 3)."""
+    def shadows(self, matrix: Float64Array) -> tuple[Shadows, Shadows]:
+        """Return the shadows under the lights after a multiplication with a matrix (3, 3), and with
+        their x and y also negated, which inverts the heights of the surface.
+        """
         from splinecli.surface.integration import integrate_normals
 
-        normals = self.normals.transformed(matrix)
         if not self.lit.any():
-            return Shadows(0.0, 0.0)
+            return Shadows(0.0, 0.0), Shadows(0.0, 0.0)
+        normals, lights = self.normals.transformed(matrix), self.lights @ matrix.T
         heights = integrate_normals(normals.normals, normals.mask, discontinuity=0)
-        cast = cast_shadows(heights, self.lights @ matrix.T)[normals.mask][self.lit]
+        return self._shadows(heights, lights), self._shadows(-heights, lights * (-1, -1, 1))
+
+    def _shadows(self, heights: Float64Array, lights: Float64Array) -> Shadows:
+        cast = cast_shadows(heights, lights)[self.normals.mask][self.lit]
         dark = self.dark[self.lit]
         common = np.count_nonzero(cast & dark)
         agreement = 0.0

@@ -11,6 +11,7 @@ from splinecli.estimate.methods.batched import context_sample, float_tensors
 from splinecli.lights.lighting import LightingAt
 from splinecli.materials.material_net import Gloss, material_networks
 from splinecli.maths import Bools, Float32Array
+from splinecli.maths.pixel_grid import on_map, slices
 from splinecli.system.machine import one_thread_each, side_by_side
 
 # in larger captures, the net is applied to every second, third, ... row and column
@@ -39,8 +40,7 @@ def estimate_gloss(mask: Bools, lighting_at: LightingAt) -> Gloss:
         _, summary = material_net(of_sample, context.brightness)
     found = np.empty((len(Gloss._fields), len(chosen)), np.float32)
 
-    def estimate(start: int) -> None:
-        part = slice(start, start + _BATCH)
+    def estimate(part: slice) -> None:
         light = lighting_at(chosen[part])
         observations, directions = float_tensors(light.observations, light.directions)
         pixels, _ = network.encode_pixels(observations, directions, context=context)
@@ -52,7 +52,7 @@ def estimate_gloss(mask: Bools, lighting_at: LightingAt) -> Gloss:
         )
         found[:, part] = torch.stack(known).numpy()
 
-    for _ in side_by_side(estimate, range(0, len(chosen), _BATCH)):
+    for _ in side_by_side(estimate, slices(len(chosen), _BATCH)):
         pass
 
     def blurred_from_chosen(values: Float32Array) -> Float32Array:
@@ -79,6 +79,4 @@ def blurred(values: Float32Array, mask: Bools, deviation: float) -> Float32Array
     """
     from cv2 import GaussianBlur
 
-    plane = np.zeros(mask.shape, np.float32)
-    plane[mask] = values
-    return np.asarray(GaussianBlur(plane, (0, 0), deviation)[mask], np.float32)
+    return np.asarray(GaussianBlur(on_map(values, mask), (0, 0), deviation)[mask], np.float32)

@@ -4,7 +4,8 @@ The radiance of a pixel is
 
     base * ((1 - metallic) * diffuse + metallic * facets) + level * (1 - metallic) * facets
 
-in the unit of the observations, where `diffuse` and `facets` are lobes of the principled BRDF. With
+in the unit of the observations, where `diffuse` and `facets` are lobes of the principled BRDF
+(Burley, "Physically Based Shading at Disney", SIGGRAPH 2012). With
 the roughness fixed, radiance is linear in the other parameters, except for Fresnel's increase at
 grazing angles. The camera looks along the z axis and lights are above the horizon, so this is at
 most 0.2 % of full reflection.
@@ -16,8 +17,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-
-from splinecli.materials.principled import PrincipledMaterial
 
 LEAST_Z = 0.05  # of a normal; the BRDF has no value for a surface that faces away from the camera
 # reflectance at normal incidence of a dielectric whose `specular` is 1 (Burley 2012)
@@ -44,46 +43,27 @@ class Geometry(NamedTuple):
 
         z points to the camera.
         """
-        n_dot_l = (
-            normals @ lights.T if lights.ndim == 2 else torch.einsum("pfc,pc->pf", lights, normals)
-        )
-        return cls(
-            n_dot_l, normals[:, 2:].clamp(min=LEAST_Z), lights[..., 2], normal_error[:, None]
-        )
-
-
-def _lobe(
-    geometry: Geometry, metallic: float, roughness: Tensor, minnaert: Tensor, tail: Tensor
-) -> Tensor:
-    """Return the radiance (P, F) of a white material without reflection of dielectrics; the tensors
-    are (P, 1).
-    """
-    one = torch.ones_like(geometry.n_dot_v)
-    zero = 0 * one
-    white = PrincipledMaterial(
-        base=one,
-        metallic=metallic * one,
-        specular=zero,
-        roughness=roughness * one,
-        sheen=zero,
-        clearcoat=zero,
-        clearcoat_gloss=zero,
-        interface_loss=zero,
-        minnaert=minnaert * one,
-        tail_exponent=tail * one,
-        second_share=zero,
-        second_roughness=one,
-        retro=zero,
-    )
-    return white.shade(*geometry[:3])
+        if lights.ndim == 2:
+            n_dot_l = normals @ lights.T
+        else:
+            n_dot_l = torch.einsum("pfc,pc->pf", lights, normals)
+        n_dot_v = normals[:, 2:].clamp(min=LEAST_Z)
+        return cls(n_dot_l, n_dot_v, lights[..., 2], normal_error[:, None])
 
 
 def diffuse_lobe(geometry: Geometry, minnaert: Tensor) -> Tensor:
     """Return the radiance (P, F) of a white matte surface, zero in attached shadow. `minnaert` is
     (P, 1) or (1, 1).
     """
-    one = torch.ones(1, 1)
-    return _lobe(geometry, 0.0, _DIFFUSE_ROUGHNESS * one, minnaert, GGX * one)
+    n_dot_l, n_dot_v, l_dot_v, _ = geometry
+    lit, one = n_dot_l.clamp(min=0), torch.ones_like(n_dot_v)
+    l_dot_h, n_dot_h_squared = half_vector_cosines(n_dot_l, n_dot_v, l_dot_v)
+    grazing_90 = 2 * _DIFFUSE_ROUGHNESS * l_dot_h * l_dot_h - 0.5
+    diffuse = (1 + grazing_90 * schlick_weight(lit)) * (1 + grazing_90 * schlick_weight(n_dot_v))
+    if bool((minnaert != 1).any()):
+        diffuse = diffuse * power((lit * n_dot_v).clamp(min=1e-4), minnaert * one - 1)
+    grazing = facets(n_dot_h_squared, lit, n_dot_v, _DIFFUSE_ROUGHNESS * one, GGX * one)
+    return (diffuse + grazing * schlick_weight(l_dot_h)) * lit
 
 
 def facet_lobe(geometry: Geometry, roughness: Tensor, tail: Tensor) -> Tensor:
@@ -94,8 +74,63 @@ def facet_lobe(geometry: Geometry, roughness: Tensor, tail: Tensor) -> Tensor:
     place is worse than a blurred one. The variance of the facets' slopes is roughness^4 / 2 (of
     Beckmann's distribution; GGX has none).
     """
-    wide = (roughness**4 + 2 * geometry.normal_error**2) ** 0.25
-    return _lobe(geometry, 1.0, wide, torch.ones(1, 1), tail)
+    n_dot_l, n_dot_v, l_dot_v, normal_error = geometry
+    lit = n_dot_l.clamp(min=0)
+    wide = (roughness**4 + 2 * normal_error**2) ** 0.25
+    _, n_dot_h_squared = half_vector_cosines(n_dot_l, n_dot_v, l_dot_v)
+    return facets(n_dot_h_squared, lit, n_dot_v, wide, tail * torch.ones_like(n_dot_v)) * lit
+
+
+def half_vector_cosines(n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> tuple[Tensor, Tensor]:
+    """Return l.h and the square of n.h, with h the half vector of light and view."""
+    # Light from behind the surface has no half vector, and rounding would give NaN.
+    l_dot_h = ((1 + l_dot_v) / 2).clamp(min=1e-6).sqrt()
+    n_dot_h = ((n_dot_l + n_dot_v) / (2 * l_dot_h)).clamp(0, 1)
+    return l_dot_h, n_dot_h * n_dot_h
+
+
+def facets(
+    n_dot_h_squared: Tensor, lit: Tensor, n_dot_v: Tensor, roughness: Tensor, tail_exponent: Tensor
+) -> Tensor:
+    """Return the microfacet distribution times its shadowing; this is GGX if the tail exponent is
+    2.
+
+    As in Disney's own later code, Smith's shadowing uses the roughness directly, without the
+    remapping of 2012. The lobe is never narrower than at roughness 0.1, which float32 still
+    resolves.
+    """
+    alpha_squared = (roughness**4).clamp(min=1e-4)
+    spread = n_dot_h_squared * (alpha_squared - 1) + 1
+    if bool((tail_exponent < 2).any()):
+        # pi times the factor that normalises the facets 1 / (1 + (a^2 - 1) (n.h)^2)^gamma; a^2 at
+        # gamma = 2
+        narrow = alpha_squared.clamp(max=0.999)
+        norm = (tail_exponent - 1) * (1 - narrow) / (narrow ** (1 - tail_exponent) - 1)
+        lobe = norm * power(spread, -tail_exponent)
+    else:
+        lobe = alpha_squared / (spread * spread)
+    return lobe * smith_ggx(n_dot_v, alpha_squared) * smith_ggx(lit, alpha_squared)
+
+
+def schlick_weight(cosine: Tensor) -> Tensor:
+    """Return (1 - cosine)^5, the weight of grazing reflection in Schlick's Fresnel
+    approximation.
+    """
+    complement = (1 - cosine).clamp(0, 1)
+    square = complement * complement
+    return square * square * complement
+
+
+def power(base: Tensor, exponent: Tensor) -> Tensor:
+    """Return base^exponent for base > 0, faster than torch.pow and accurate enough for images."""
+    return (base.log() * exponent).exp()
+
+
+def smith_ggx(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
+    """Return Smith's shadowing of the GGX distribution over 2 n.x: 1 / (n.x + sqrt(a^2 + (1 -
+    a^2)(n.x)^2)).
+    """
+    return 1 / (cosine + (alpha_squared + (1 - alpha_squared) * cosine * cosine).sqrt())
 
 
 _RELATIVE, _DEGREES_OF_FREEDOM = 0.05, 3.0
@@ -106,7 +141,7 @@ A sharp lobe also changes with the normals' errors, at most by the last share of
 _STEPS = 4  # of the robust fit of a base
 
 
-class Sample(NamedTuple):
+class LitPixels(NamedTuple):
     """Observations with their geometry and errors."""
 
     observations: Tensor  # (P, F)
@@ -124,7 +159,7 @@ class Base(NamedTuple):
 
 
 def fit_base(
-    sample: Sample,
+    sample: LitPixels,
     slope: Tensor,
     offset: Tensor,
     of_facets: Tensor,
@@ -148,9 +183,8 @@ def fit_base(
     weights = sample.lit / (2 * _RELATIVE * observed + floor) ** 2
     for _ in range(_STEPS):
         above = (weights * slope * (observed - offset)).sum(1, keepdim=True) + pulled
-        base = (
-            above / ((weights * slope * slope).sum(1, keepdim=True) + pull).clamp(min=1e-12)
-        ).clamp(min=0)
+        below = (weights * slope * slope).sum(1, keepdim=True) + pull
+        base = (above / below.clamp(min=1e-12)).clamp(min=0)
         radiance = base * slope + offset
         variance = (
             (_RELATIVE * radiance) ** 2 + (lobe_error * (base * of_facets + offset)) ** 2 + floor**2
@@ -168,7 +202,7 @@ def lobe_error(geometry: Geometry, roughness: Tensor) -> Tensor:
     return (geometry.normal_error / (2 * wide.clamp(min=0.01))).clamp(max=_MOST_LOBE_ERROR)
 
 
-def predict_left_out(sample: Sample, slope: Tensor, offset: Tensor, weights: Tensor) -> Tensor:
+def predict_left_out(sample: LitPixels, slope: Tensor, offset: Tensor, weights: Tensor) -> Tensor:
     """Return the predictions (P, F) of base * slope + offset, each fitted to the other observations
     of its pixel.
     """

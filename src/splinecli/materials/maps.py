@@ -20,7 +20,7 @@ from splinecli.materials.lobes import (
     F0_OF_SPECULAR,
     Base,
     Geometry,
-    Sample,
+    LitPixels,
     diffuse_lobe,
     facet_lobe,
     fit_base,
@@ -29,6 +29,7 @@ from splinecli.materials.lobes import (
 )
 from splinecli.materials.material_net import Gloss
 from splinecli.maths import Bools, Float32Array, Floats
+from splinecli.maths.pixel_grid import on_map
 from splinecli.records.output_files import MAPS
 from splinecli.surface.integration import integrate_normals
 
@@ -42,10 +43,7 @@ _MOST_EXPOSURE = 10.0  # times the exposure that makes the brightest bases white
 _SURE = 0.1  # the error of a roughness that the confidence refers to
 _LAPLACE = 1.41  # standard deviation of a Laplace distribution, in mean absolute errors
 # of the bright pixels' albedo and the mean observation: errors of all observations
-_FLOOR, _FLAT = (
-    0.005,
-    0.12,
-)
+_FLOOR, _FLAT = 0.005, 0.12
 _WHITE = 0.999  # quantile of the observations
 _GRAY = 1e-3  # of the tint, below which all channels are equal
 _NORMAL_ERROR = 0.04  # radians, without a confidence
@@ -111,12 +109,10 @@ def estimate_material(
         InputError: there are too few lights.
     """
     MAPS["material"].check_lights(len(lights))
-    normal_map = np.zeros((*mask.shape, 3), np.float32)
-    normal_map[mask] = normals
     pixels = _Pixels(
         normals,
         _normal_error(normals, normal_confidence),
-        lights_that_reach(normal_map, mask, lights),
+        lights_that_reach(on_map(normals, mask), mask, lights),
         lighting_at,
     )
     bright, white = pixels.brightness()
@@ -197,7 +193,7 @@ def lights_that_reach(normal_map: Floats, mask: Bools, lights: Floats) -> Bools:
     heights = integrate_normals(normal_map[::step, ::step] * coarse[..., None], coarse)
     lit = ~cast_shadows(heights, np.asarray(lights, np.float64))
     rows, columns = np.nonzero(mask)
-    return np.asarray(lit[rows // step, columns // step])
+    return lit[rows // step, columns // step]
 
 
 def _normal_error(normals: Float32Array, confidence: Float32Array | None) -> Float32Array:
@@ -219,22 +215,21 @@ class _Pixels:
     reached: Bools  # (P, F)
     lighting_at: LightingAt
 
-    def take(self, chosen: PixelIndices, bright: float, white: float = np.inf) -> Sample:
+    def take(self, chosen: PixelIndices, bright: float, white: float = np.inf) -> LitPixels:
         """Return some of the pixels as the fits need them; `bright` is the albedo of bright
         pixels.
         """
         light: PixelLighting = self.lighting_at(chosen)
-        normals, normal_error = (
+        observations, directions, normals, normal_error = float_tensors(
+            light.observations,
+            light.directions,
             light.in_frame_of_pixels(self.normals[chosen]),
             self.normal_error[chosen],
         )
-        observations, directions, *own = float_tensors(
-            light.observations, light.directions, normals, normal_error
-        )
-        geometry = Geometry.of(own[0], directions, own[1])
+        geometry = Geometry.of(normals, directions, normal_error)
         reached = torch.from_numpy(self.reached[chosen]) & (geometry.n_dot_l > _LIT)
         floor = _FLAT * observations.mean(1, keepdim=True) + _FLOOR * bright
-        return Sample(observations, geometry, reached.float(), floor, white)
+        return LitPixels(observations, geometry, reached.float(), floor, white)
 
     def brightness(self) -> tuple[float, float]:
         """Return the albedo of bright pixels, and the value of white in a picture."""
@@ -252,7 +247,9 @@ class _Pixels:
         )
 
 
-def _fit(sample: Sample, gloss: Gloss, chosen: PixelIndices) -> tuple[Float32Array, Float32Array]:
+def _fit(
+    sample: LitPixels, gloss: Gloss, chosen: PixelIndices
+) -> tuple[Float32Array, Float32Array]:
     """Return five columns (p, 5), and the weights (p, F) of the observations in the base.
 
     The columns are base, the contribution of white highlights to the weighted observations, which
@@ -262,11 +259,8 @@ def _fit(sample: Sample, gloss: Gloss, chosen: PixelIndices) -> tuple[Float32Arr
     def column(values: Tensor) -> Tensor:
         return values[chosen][:, None]
 
-    geometry, roughness, metalness = (
-        sample.geometry,
-        column(gloss.roughness),
-        column(gloss.metalness),
-    )
+    geometry = sample.geometry
+    roughness, metalness = column(gloss.roughness), column(gloss.metalness)
     facets = facet_lobe(geometry, roughness, column(gloss.tail))
     of_facets = metalness * facets
     slope = (1 - metalness) * diffuse_lobe(geometry, column(gloss.minnaert)) + of_facets
@@ -283,7 +277,7 @@ def _fit(sample: Sample, gloss: Gloss, chosen: PixelIndices) -> tuple[Float32Arr
 
 
 def _compare(
-    sample: Sample, slope: Tensor, offset: Tensor, weights: Tensor
+    sample: LitPixels, slope: Tensor, offset: Tensor, weights: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return a matte surface's reflectance (P,) and the two sums (P,) that determine how much of
     the material to trust.

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import softplus
 
 from splinecli.estimate.networks.set_branch import (
     ContextLayer,
@@ -76,10 +77,10 @@ class MaterialNet(nn.Module):
         numbers = self.out(tokens).unbind(dim=1)
         gloss = Gloss(
             roughness=numbers[0].sigmoid(),
-            roughness_error=nn.functional.softplus(numbers[1] - 2) + _LEAST_ERROR,
+            roughness_error=softplus(numbers[1] - 2) + _LEAST_ERROR,
             metalness=numbers[2].sigmoid(),
             log_base=numbers[3],
-            log_base_error=nn.functional.softplus(numbers[4] - 1) + _LEAST_ERROR,
+            log_base_error=softplus(numbers[4] - 1) + _LEAST_ERROR,
             log_level=numbers[5] - 3,
             minnaert=1 + 0.5 * numbers[6].tanh(),
             tail=1.5 + 0.5 * numbers[7].tanh(),

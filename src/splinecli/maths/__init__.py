@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 Bools = NDArray[np.bool_]
 Integers = NDArray[np.integer]
+Indices = NDArray[np.intp]
 Floats = NDArray[np.floating]  # of any precision
 Float32Array = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]  # RGB (H, W, 3) or gray (H, W), of 8 bits

@@ -16,6 +16,8 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from splinecli.maths import Bools, Float32Array, Float64Array, Floats
+
 Convention = Literal["opengl", "directx"]
 
 # The background of an encoded image may be gray, which stands for the zero vector. No real normal
@@ -33,14 +35,14 @@ def unit(vectors: NDArray[_Float]) -> NDArray[_Float]:
     return scaled
 
 
-def spread_of(normals: NDArray[np.floating]) -> float:
+def spread_of(normals: Floats) -> float:
     """Return the second largest standard deviation of unit normals (P, 3):
     small for a flat object.
     """
     return float(np.sqrt(np.linalg.eigvalsh(np.cov(normals.T))[1]))
 
 
-def angle_between_deg(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
+def angle_between_deg(a: Floats, b: Floats) -> Float64Array:
     """Return the angles (...) in degrees between unit vectors a and b (..., 3), float64.
 
     Uses atan2 of the cross and the dot product, which is accurate near 0 and 180 degrees, where
@@ -49,13 +51,13 @@ def angle_between_deg(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArr
     a64, b64 = np.asarray(a, np.float64), np.asarray(b, np.float64)
     sine = np.linalg.norm(np.cross(a64, b64), axis=-1)
     cosine = np.einsum("...i,...i->...", a64, b64)
-    degrees: NDArray[np.float64] = np.degrees(np.arctan2(sine, cosine))
+    degrees: Float64Array = np.degrees(np.arctan2(sine, cosine))
     return degrees
 
 
 def encode_picture(
-    normals: NDArray[np.floating],
-    mask: NDArray[np.bool_],
+    normals: Floats,
+    mask: Bools,
     *,
     bits: int = 16,
     convention: Convention = "opengl",
@@ -76,12 +78,11 @@ def encode_picture(
 
 def describe(convention: Convention) -> str:
     """Return the text to write into normal map files: the frame, and the direction of green."""
-    return (
-        f"x right, y up, z to the camera; green is y {'up' if convention == 'opengl' else 'down'}"
-    )
+    green = "up" if convention == "opengl" else "down"
+    return f"x right, y up, z to the camera; green is y {green}"
 
 
-def decode_picture(picture: NDArray[np.unsignedinteger]) -> NDArray[np.float64]:
+def decode_picture(picture: NDArray[np.unsignedinteger]) -> Float64Array:
     """Decode an RGB image (..., 3) of 8 or 16 bits, green up, to unit normals.
 
     Black and middle gray become zero vectors.
@@ -89,9 +90,7 @@ def decode_picture(picture: NDArray[np.unsignedinteger]) -> NDArray[np.float64]:
     vectors = picture.astype(np.float64) * 2 / np.iinfo(picture.dtype).max - 1
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     is_normal = picture.any(axis=-1, keepdims=True) & (length > SHORTEST_IN_PICTURE)
-    decoded: NDArray[np.float64] = np.divide(
-        vectors, length, out=np.zeros_like(vectors), where=is_normal
-    )
+    decoded: Float64Array = np.divide(vectors, length, out=np.zeros_like(vectors), where=is_normal)
     return decoded
 
 
@@ -108,9 +107,7 @@ class AngularErrors:
     under_10: float
 
 
-def angular_error_map_deg(
-    normals: NDArray[np.floating], ground_truth: NDArray[np.floating], mask: NDArray[np.bool_]
-) -> NDArray[np.float32]:
+def angular_error_map_deg(normals: Floats, ground_truth: Floats, mask: Bools) -> Float32Array:
     """Return the angular errors (H, W) of a normal map (H, W, 3) in degrees.
 
     They are NaN outside the mask (H, W) and where the ground truth (H, W, 3) is zero. The sign of a
@@ -119,14 +116,12 @@ def angular_error_map_deg(
     scored = mask & ground_truth.any(axis=-1)
     errors = np.full(mask.shape, np.nan, np.float32)
     # Row by row, because a map of many megapixels in float64 would need several gigabytes.
-    for row, row_scored, row_normals, row_truth in zip(
-        errors, scored, normals, ground_truth, strict=True
-    ):
-        row[row_scored] = angle_between_deg(row_normals[row_scored], row_truth[row_scored])
+    for row, chosen in enumerate(scored):
+        errors[row, chosen] = angle_between_deg(normals[row, chosen], ground_truth[row, chosen])
     return errors
 
 
-def summarise_errors(errors_deg: NDArray[np.floating]) -> AngularErrors | None:
+def summarise_errors(errors_deg: Floats) -> AngularErrors | None:
     """Return the statistics of angular errors in degrees of any shape, without NaN; None if all are
     NaN.
     """
@@ -142,9 +137,7 @@ def summarise_errors(errors_deg: NDArray[np.floating]) -> AngularErrors | None:
     )
 
 
-def gradient_of_normals(
-    normal_map: NDArray[np.float32], mask: NDArray[np.bool_]
-) -> NDArray[np.float32]:
+def gradient_of_normals(normal_map: Float32Array, mask: Bools) -> Float32Array:
     """Return the slopes p = dz/dx and q = dz/dy, (H, W, 2); NaN outside the mask and where the
     surface is too steep.
 
@@ -155,9 +148,7 @@ def gradient_of_normals(
     return np.asarray(-normal_map[..., :2] / z[..., None], np.float32)
 
 
-def curvature_of_normals(
-    normal_map: NDArray[np.float32], mask: NDArray[np.bool_], sigma: float = 2.0
-) -> NDArray[np.float32]:
+def curvature_of_normals(normal_map: Float32Array, mask: Bools, sigma: float = 2.0) -> Float32Array:
     """Return mean and Gaussian curvature (H, W, 2), in 1/pixel and 1/pixel^2; NaN outside the mask.
 
     Both are positive on a bump: a sphere of radius R has 1/R and 1/R^2. A hollow has a negative
@@ -172,8 +163,8 @@ def curvature_of_normals(
 
 
 def _derivatives(
-    values: NDArray[np.float32], mask: NDArray[np.bool_], sigma: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    values: Float32Array, mask: Bools, sigma: float
+) -> tuple[Float64Array, Float64Array]:
     """Return the derivatives (H, W) of values by x (right) and y (up).
 
     They are the slopes of a plane that is fitted to the values of the mask with Gaussian weights.
@@ -182,7 +173,7 @@ def _derivatives(
     """
     from scipy.ndimage import gaussian_filter
 
-    def moment(of: NDArray[np.float64], down: int, right: int) -> NDArray[np.float64]:
+    def moment(of: Float64Array, down: int, right: int) -> Float64Array:
         """Return the sum of the weighted `of`, times offsets to these powers."""
         found = sigma ** (2 * (down + right)) * gaussian_filter(
             of, sigma, order=(down, right), mode="constant"
@@ -202,6 +193,5 @@ def _derivatives(
     of_right = moment(inner, 0, 1) / weight - value * right
     of_down = moment(inner, 1, 0) / weight - value * down
     determinant = np.maximum(rr * dd - rd**2, least**2)
-    return (dd * of_right - rd * of_down) / determinant, -(
-        rr * of_down - rd * of_right
-    ) / determinant
+    to_right, to_down = dd * of_right - rd * of_down, rr * of_down - rd * of_right
+    return to_right / determinant, -to_down / determinant

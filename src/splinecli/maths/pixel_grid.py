@@ -9,8 +9,9 @@ docs/files-and-frames.md: x right, y up, z to the camera.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +20,28 @@ from splinecli.errors import InputError, UsageError
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Floats, Integers
 
 Places = NDArray[np.number[Any]]
+Value = TypeVar("Value", bound=np.generic)
 
 # Largest number in a camera matrix. Beyond it, equations of integration overflow or are singular.
 _LARGEST = 1e6
+
+
+def on_map(values: NDArray[Value], mask: Bools) -> NDArray[Value]:
+    """Return the map (H, W, ...) of the values (P, ...) of a mask's pixels (H, W), zero outside."""
+    placed = np.zeros((*mask.shape, *values.shape[1:]), values.dtype)
+    placed[mask] = values
+    return placed
+
+
+def bounds(mask: Bools) -> tuple[Integers, Integers]:
+    """Return the first and last row (2,), and the first and last column (2,), of a mask."""
+    rows, columns = (np.flatnonzero(mask.any(axis=axis))[[0, -1]] for axis in (1, 0))
+    return rows, columns
+
+
+def slices(count: int, size: int) -> Iterator[slice]:
+    """Yield slices of at most `size` that together cover `count` items."""
+    return (slice(start, start + size) for start in range(0, count, size))
 
 
 def pixel_rays(mask: Bools, camera_matrix: Floats) -> Float64Array:
@@ -57,7 +77,7 @@ def image_points(
             points[:, :2] * (1, -1) + ((shape[1] - 1) / 2, (shape[0] - 1) / 2), np.float64
         )
     image = points.astype(np.float64) * (1, -1, -1) @ np.asarray(camera_matrix, np.float64).T
-    return np.asarray(image[:, :2] / image[:, 2:])
+    return image[:, :2] / image[:, 2:]
 
 
 def focal_length(camera_matrix: Floats) -> float:
@@ -80,8 +100,8 @@ def ray_basis(camera_matrix: Floats) -> Float64Array:
         and (matrix[2] == (0, 0, 1)).all()
     ):
         raise InputError(
-            f"{matrix.tolist()} is not a camera matrix [[fx, s, cx], [0, fy, cy], [0, 0, 1]]"
-            " with positive fx and fy, and numbers of at most a million",
+            f"{matrix.tolist()} is not a camera matrix [[fx, s, cx], [0, fy, cy], [0, 0,"
+            " 1]] with positive fx and fy, and numbers of at most a million",
             hint="Give it in pixels, with columns to the right and rows down",
         )
     return np.asarray(np.linalg.inv(matrix).T * (1, -1, -1), np.float64)
@@ -129,10 +149,8 @@ class Blocks:
         """
         if camera_matrix is None:
             return None
-        shrunk = (
-            np.array(((1, 0, -self._shift), (0, 1, -self._shift), (0, 0, self.step))) / self.step
-        )
-        return np.asarray(shrunk @ camera_matrix)
+        shrunk = np.array(((1, 0, -self._shift), (0, 1, -self._shift), (0, 0, self.step)))
+        return shrunk / self.step @ camera_matrix
 
     def interpolate(self, depth: Floats, mask: Bools) -> Floats:
         """Return the depths (P,) of the pixels of a mask (H, W) from the depths of the blocks (h,
@@ -150,7 +168,7 @@ class Blocks:
     def numbers_at(self, rows: Integers, columns: Integers) -> Integers:
         """Return the numbers (P,) of the blocks of some pixels."""
         number = (np.cumsum(self.mask) - 1).reshape(self.mask.shape)
-        return np.asarray(number[rows // self.step, columns // self.step])
+        return number[rows // self.step, columns // self.step]
 
     def spread(self, values: Array) -> Array:
         """Return the map (h, w, ...) of the values (p, ...) of the blocks; other cells copy the

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import UsageError
-from splinecli.maths import Float64Array
+from splinecli.maths import Float32Array, Float64Array, Floats
 
 _LINEAR_BELOW = 0.0031308  # linear value below which the sRGB curve is a straight line
 
@@ -28,7 +28,7 @@ BT709: TransferCurve = tuple(
 GAMMAS = 0.1, 10.0  # the smallest and the largest exponent
 
 
-def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
+def encode_srgb(linear: Floats) -> NDArray[np.uint8]:
     """Encode linear values as 8-bit sRGB; values outside 0 to 1 are clipped."""
     values = np.clip(linear, 0, 1)
     power = 1.055 * np.maximum(values, _LINEAR_BELOW) ** (1 / 2.4) - 0.055
@@ -54,12 +54,12 @@ def parse_transfer(text: str) -> float | None:
         if GAMMAS[0] <= gamma <= GAMMAS[1]:
             return gamma
     raise UsageError(
-        f"the transfer curve is {text!r}; expected auto, linear, srgb, or gamma:G with G from 0.1"
-        " to 10"
+        f"the transfer curve is {text!r}; expected auto, linear, srgb,"
+        " or gamma:G with G from 0.1 to 10"
     )
 
 
-def decode_transfer(stored: NDArray[np.float32], curve: TransferCurve) -> NDArray[np.float32]:
+def decode_transfer(stored: Float32Array, curve: TransferCurve) -> Float32Array:
     """Decode stored values, 0 to 1, to linear ones."""
     if curve == 1:
         return stored

@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import OutputError
-from splinecli.maths import Bools, Float32Array, Floats
+from splinecli.maths import Bools, Float32Array, Floats, Picture
 from splinecli.maths.normals import unit
 from splinecli.maths.transfer import encode_srgb
-
-Picture = NDArray[np.uint8]  # an RGB picture (H, W, 3) or a gray picture (H, W) of 8 bits
 
 
 def encode_png(
@@ -36,16 +34,12 @@ def encode_png(
         raise OutputError("the picture cannot be encoded as PNG")
     file = encoded.tobytes()
     # Neither OpenCV nor Pillow writes both 16-bit colours and texts.
-    chunks = [
-        b"tEXt" + f"{keyword}\0{text}".encode("latin-1") for keyword, text in (texts or {}).items()
-    ]
+    chunks = [f"tEXt{key}\0{text}".encode("latin-1") for key, text in (texts or {}).items()]
     chunks += [b"cICP\x01\x01\x00\x01"] if film else []
-    whole = [
-        struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
-        for chunk in chunks
-    ]
-    # behind the header, which is the first chunk of a file
-    return file[:33] + b"".join(whole) + file[33:]
+    added = b""
+    for chunk in chunks:
+        added += struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    return file[:33] + added + file[33:]  # behind the header, which is the first chunk of a file
 
 
 PREVIEW_LIGHT = (-0.72, 0.48, 0.5)  # direction: low, from the upper left, which shows relief best
@@ -56,10 +50,10 @@ TITLE = "angular error (deg)"
 
 
 def albedo_picture(albedo: Float32Array, mask: Bools) -> Picture:
-    """Return a linear albedo map (H, W, 3) as an sRGB picture, in which the brightest 1 % of the
-    pixels are white.
+    """Return a linear albedo map (H, W, 3) as an sRGB picture.
 
-    The scale depends on the pixels of the mask (H, W) alone, which is not empty.
+    The brightest 1 % of the pixels are white. The scale depends on the pixels of the mask (H, W)
+    alone, which is not empty.
     """
     white = max(float(np.quantile(albedo[mask].max(axis=1), 0.99)), 1e-12)
     return encode_srgb(albedo / white)
@@ -71,16 +65,18 @@ def confidence_picture(confidence_map: Float32Array, _: Bools | None = None) -> 
 
 
 def preview_picture(normal_map: Float32Array, mask: Bools) -> Picture:
-    """Return an sRGB picture (H, W, 3) of the surface, matte white under PREVIEW_LIGHT, black
-    outside the mask.
+    """Return an sRGB picture (H, W, 3) of the surface, matte white under PREVIEW_LIGHT.
+
+    It is black outside the mask.
     """
     shading = (normal_map @ unit(np.array(PREVIEW_LIGHT, np.float32))) * mask
     return np.repeat(encode_srgb(shading)[..., None], 3, axis=2)
 
 
 def signed_picture(values: Float32Array, _: Bools, scale: float) -> Picture:
-    """Return values (H, W) or the first of (H, W, C) as a gray picture: 0 and NaN gray, -scale
-    black, scale white.
+    """Return values (H, W) or the first of (H, W, C) as a gray picture.
+
+    0 and NaN are gray, -scale is black, scale is white.
     """
     first = values if values.ndim == 2 else values[..., 0]
     share = np.nan_to_num(first / scale).clip(-1, 1)
@@ -88,8 +84,9 @@ def signed_picture(values: Float32Array, _: Bools, scale: float) -> Picture:
 
 
 def colour_errors(error_map_deg: Floats) -> Picture:
-    """Return the colours (H, W, 3) of errors (H, W) in degrees: viridis, from violet for 0 to
-    yellow; white for NaN.
+    """Return the colours (H, W, 3) of errors (H, W) in degrees, white for NaN.
+
+    The scale is viridis, from violet for 0 to yellow.
     """
     import cv2
 

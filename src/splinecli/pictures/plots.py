@@ -1,25 +1,22 @@
-"""Plots: light directions, observation maps, learning curves, and the maps of several methods side
-by side.
-"""
+"""Plots: light directions, observation maps, learning curves, and maps of several methods."""
 
 from __future__ import annotations
 
 import io
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from splinecli.capture.formats.images import read_image
 from splinecli.errors import printable
 from splinecli.estimate.methods import method_names
-from splinecli.maths import Bools, Float64Array, Floats, Integers
+from splinecli.maths import Bools, Float64Array, Floats, Integers, Picture
 from splinecli.maths.normals import encode_picture, unit
-from splinecli.pictures.maps import TICKS, TITLE, TOP_DEG, Picture, bounding_box, colour_errors
+from splinecli.pictures.maps import TICKS, TITLE, TOP_DEG, bounding_box, colour_errors
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from splinecli.lights.calibration.balls import BallCalibration
@@ -51,10 +48,10 @@ _STYLES = tuple(map(MethodStyle, _COLOURS, "osD^vXP*h"))
 
 
 def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
-    """Return the style of each method. It depends on the registry's order, so it is the same in
-    every plot.
+    """Return the style of each method.
 
-    Names that are not in the registry follow in their order.
+    It depends on the registry's order, so it is the same in every plot. Names that are not in the
+    registry follow in their order.
     """
     known = method_names()
     places = known + [name for name in methods if name not in known]
@@ -87,17 +84,15 @@ def sky_plot(
     angle = np.linspace(0, 2 * np.pi, 361)
     for ring_deg in (15, 30, 45, 60, 75, 90):
         radius = np.sin(np.radians(ring_deg))
-        axes.plot(
-            radius * np.cos(angle), radius * np.sin(angle), color="0.8", linewidth=1, zorder=1
-        )
+        x, y = radius * np.cos(angle), radius * np.sin(angle)
+        axes.plot(x, y, color="0.8", linewidth=1, zorder=1)
         if ring_deg < 90:  # the labels of 90 and 75 degrees would overlap
             axes.text(0, -radius, f"{ring_deg}°", color="0.5", fontsize=8, ha="center", va="bottom")
     x, y = light_directions[:, 0], light_directions[:, 1]
     if errors_deg is not None:  # circles on the sphere around the directions
         radii = np.radians(errors_deg)[:, None, None]
-        across = unit(
-            np.cross(light_directions, np.eye(3)[np.abs(light_directions).argmin(axis=1)])
-        )
+        smallest = np.abs(light_directions).argmin(axis=1)
+        across = unit(np.cross(light_directions, np.eye(3)[smallest]))
         turned = np.cross(light_directions, across)
         around = across[:, None] * np.cos(angle)[:, None] + turned[:, None] * np.sin(angle)[:, None]
         for outline in light_directions[:, None] * np.cos(radii) + around * np.sin(radii):
@@ -118,39 +113,38 @@ _SMALL = 8  # points
 def observation_map_figure(
     sparse: Floats,
     dense: Floats | None,
-    truth: Floats | None,
+    truth: Mapping[str, Floats],
     *,
     error_deg: Floats,
     pixels: Integers | None = None,
-    truth_label: str = "true map, all lights",
     title: str = "",
     grid: Grid = "even",
 ) -> bytes:
-    """Return a PNG file with a row for each of N pixels: sparse map, LI-Net's dense map, map of all
-    lights.
+    """Return a PNG file with a row of observation maps for each of N pixels.
 
-    Row 0 of a map is y = +1. The maps of a pixel share one frame, either the camera's or the
-    pixel's. Values are relative to the largest observation, from 0 to 1. Empty cells are gray; the
-    circle is the horizon.
+    The columns are the sparse map, the dense map of LI-Net, and the map of all lights. Row 0 of a
+    map is y = +1. The maps of a pixel share one frame, either the camera's or the pixel's. Values
+    are relative to the largest observation, from 0 to 1. Empty cells are gray; the circle is the
+    horizon.
 
     Args:
         sparse: (N, w, w), NaN in empty cells.
         dense: the same; None for a network without a LI-Net.
-        truth: (N, w, w), NaN in cells without a value; None to leave it out.
+        truth: label of the true maps -> (N, w, w), NaN in cells without a value; may be empty.
         error_deg: (N,) errors of the estimated normals, in degrees.
         pixels: (N, 2) row and column in the image; None to leave them out.
-        truth_label: label of the true maps.
         title: title of the figure; empty for none.
         grid: how light directions are assigned to cells.
     """
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle
 
-    labelled = {"sparse map": sparse, "LI-Net's dense map": dense, truth_label: truth}
-    columns = {label: maps for label, maps in labelled.items() if maps is not None}
-    figure = Figure(
-        figsize=(1.7 * len(columns) + 0.8, (1.7 + 0.25) * len(sparse) + 0.7), layout="constrained"
-    )
+    columns = {"sparse map": sparse}
+    if dense is not None:
+        columns["LI-Net's dense map"] = dense
+    columns |= truth
+    size_inches = 1.7 * len(columns) + 0.8, (1.7 + 0.25) * len(sparse) + 0.7
+    figure = Figure(figsize=size_inches, layout="constrained")
     if title:
         figure.suptitle(title, fontsize=9, parse_math=False)
     # In matplotlib, cell k reaches from k - 1/2 to k + 1/2. In the authors' grid, the last column
@@ -163,21 +157,14 @@ def observation_map_figure(
     for place, (name, maps) in enumerate(columns.items()):
         for axis, values in zip(axes[:, place], maps, strict=True):
             image = axis.imshow(values, vmin=0, vmax=1, cmap="viridis", interpolation="nearest")
-            axis.set_xticks([])
-            axis.set_yticks([])
-            axis.set_facecolor("0.85")  # light gray, which the colour scale does not contain
-            circle = Circle(
-                centre, radius, fill=False, edgecolor="black", linewidth=0.8, clip_on=False
-            )
-            axis.add_patch(circle)
+            # light gray, which the colour scale does not contain
+            axis.set(xticks=[], yticks=[], facecolor="0.85")
+            line = {"edgecolor": "black", "linewidth": 0.8, "clip_on": False}
+            axis.add_patch(Circle(centre, radius, fill=False, **line))
         axes[-1, place].set_xlabel(name, fontsize=_SMALL)
-    places = (
-        [""] * len(sparse)
-        if pixels is None
-        else [f"row {row}, column {col}: " for row, col in pixels]
-    )
-    for axis, place_in_image, error in zip(axes[:, 0], places, error_deg, strict=True):
-        axis.set_title(f"{place_in_image}{error:.1f} deg off", fontsize=_SMALL, loc="left")
+    for number, error in enumerate(error_deg):
+        where = "" if pixels is None else "row {}, column {}: ".format(*pixels[number])
+        axes[number, 0].set_title(f"{where}{error:.1f} deg off", fontsize=_SMALL, loc="left")
     bar = figure.colorbar(image, ax=axes, shrink=min(1, 2 / len(sparse)), aspect=25)
     bar.set_label("relative to the largest observation", fontsize=_SMALL)
     bar.ax.tick_params(labelsize=_SMALL)
@@ -188,8 +175,7 @@ Columns = Mapping[str, Sequence[float | None]]
 
 
 def training_figure(columns: Columns) -> Figure:
-    """Return a matplotlib figure of the loss, the angular errors and the map errors against the
-    step.
+    """Return a figure of the loss, the angular errors and the map errors against the step.
 
     `columns` has the columns of metrics.csv by name, all of one length; None marks a value that was
     not computed.
@@ -198,42 +184,32 @@ def training_figure(columns: Columns) -> Figure:
 
     figure = Figure(figsize=(12, 3.6), layout="constrained")
     loss, angle, maps = figure.subplots(1, 3)
-    loss.set_title("loss")
-    _plot(loss, columns, "loss", "weighted sum")
-    _plot(loss, columns, "symmetric", "Ls, unweighted", alpha=0.5)
-    _plot(loss, columns, "asymmetric", "La, unweighted", alpha=0.5)
-    angle.set_title("mean angular error (deg)")
-    _plot(angle, columns, "angle_deg", "training", alpha=0.5)
-    _plot(angle, columns, "validation_deg", "validation", style="o-")
-    maps.set_title("mean error of the dense map")
-    _plot(maps, columns, "map_error", "all cells")
-    _plot(maps, columns, "masked_map_error", "cells with a light")
-    for axes in (loss, angle, maps):
+    for axes, name, label, style, alpha in (
+        (loss, "loss", "weighted sum", "-", 1),
+        (loss, "symmetric", "Ls, unweighted", "-", 0.5),
+        (loss, "asymmetric", "La, unweighted", "-", 0.5),
+        (angle, "angle_deg", "training", "-", 0.5),
+        (angle, "validation_deg", "validation", "o-", 1),
+        (maps, "map_error", "all cells", "-", 1),
+        (maps, "masked_map_error", "cells with a light", "-", 1),
+    ):
+        pairs = zip(columns["step"], columns[name], strict=True)
+        points = [(step, value) for step, value in pairs if value is not None]
+        if points:
+            style = "o" if len(points) == 1 else style  # one point does not make a line
+            axes.plot(*zip(*points, strict=True), style, label=label, alpha=alpha)
+    titles = ("loss", "mean angular error (deg)", "mean error of the dense map")
+    for axes, title in zip((loss, angle, maps), titles, strict=True):
         axes.set_visible(bool(axes.lines))
         if not axes.lines:
             continue
-        axes.set_xlabel("step")
+        axes.set(title=title, xlabel="step")
         axes.grid(alpha=0.3)
         axes.legend()
         values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.lines])
-        if (
-            (values > 0).all() and values.max() > 20 * values.min()
-        ):  # An axis whose values span more is logarithmic.
-            axes.set_yscale("log")
+        if (values > 0).all() and values.max() > 20 * values.min():
+            axes.set_yscale("log")  # for values that span more
     return figure
-
-
-def _plot(
-    axes: Axes, columns: Columns, name: str, label: str, *, style: str = "-", alpha: float = 1
-) -> None:
-    points = [
-        (step, value)
-        for step, value in zip(columns["step"], columns[name], strict=True)
-        if value is not None
-    ]
-    if points:
-        style = "o" if len(points) == 1 else style  # one point does not make a line
-        axes.plot(*zip(*points, strict=True), style, label=label, alpha=alpha)
 
 
 _MAPS_DPI = 100
@@ -247,13 +223,13 @@ def method_maps(
     *,
     title: str,
 ) -> bytes:
-    """Return a PNG file with a column for the ground truth and one for each method: normal map
-    above error map.
+    """Return a PNG file of the ground truth and the maps of several methods, side by side.
 
-    Normals have the colours (n + 1) / 2, errors the scale of colour_errors from 0 to TOP_DEG; other
-    pixels are white. The maps are cropped to the mask's bounding box. Small maps are enlarged by a
-    whole factor and large ones averaged, so that the picture stays below 4000 pixels wide. The MAE
-    below each method covers the pixels that have errors.
+    Each column has a normal map above an error map. Normals have the colours (n + 1) / 2, errors
+    the scale of colour_errors from 0 to TOP_DEG; other pixels are white. The maps are cropped to
+    the mask's bounding box. Small maps are enlarged by a whole factor and large ones averaged, so
+    that the picture stays below 4000 pixels wide. The MAE below each method covers the pixels that
+    have errors.
 
     The ground truth (H, W, 3) is unit, or zero where it is unknown; the mask (H, W) is not empty.
     Each method, in the order of the columns, has normals (H, W, 3) and errors (H, W), NaN in pixels
@@ -264,16 +240,9 @@ def method_maps(
     box = bounding_box(mask)
     height, width = mask[box].shape
     scale = _scale(height, width, columns=1 + len(normal_maps))
-    truth = _resize(
-        _colour_normals(ground_truth[box], mask[box] & ground_truth[box].any(axis=-1)), scale
-    )
-    normals = {
-        name: _resize(_colour_normals(n[box], mask[box]), scale) for name, n in normal_maps.items()
-    }
-    shown_deg = {
-        name: np.where(mask, error_deg, np.nan) for name, error_deg in error_maps_deg.items()
-    }
-    errors = {name: _resize(colour_errors(shown_deg[name][box]), scale) for name in normal_maps}
+    known = mask[box] & ground_truth[box].any(axis=-1)
+    truth = _resize(_colour_normals(ground_truth[box], known), scale)
+    shown_deg = {name: np.where(mask, error_maps_deg[name], np.nan) for name in normal_maps}
     captions = {name: f"MAE {np.nanmean(shown_deg[name]):.2f}°" for name in normal_maps}
 
     # pixels: room for the colour bar and a name
@@ -287,10 +256,8 @@ def method_maps(
     figure = Figure(figsize=(width / _MAPS_DPI, height / _MAPS_DPI), dpi=_MAPS_DPI)
 
     def show(picture: Picture, left: int, bottom: int) -> None:
-        x, y = (
-            left + (cell_width - picture.shape[1]) // 2,
-            bottom + (cell_height - picture.shape[0]) // 2,
-        )
+        x = left + (cell_width - picture.shape[1]) // 2
+        y = bottom + (cell_height - picture.shape[0]) // 2
         figure.figimage(picture[::-1], x, y, origin="lower")
 
     show(truth, gap, normals_at)
@@ -298,25 +265,22 @@ def method_maps(
     _draw_bar(figure, gap + cell_width - text, errors_at, cell_height, text)
     for column, name in enumerate(normal_maps, start=1):
         left = gap + column * (cell_width + gap)
-        show(normals[name], left, normals_at)
-        show(errors[name], left, errors_at)
+        normals = _colour_normals(normal_maps[name][box], mask[box])
+        show(_resize(normals, scale), left, normals_at)
+        show(_resize(colour_errors(shown_deg[name][box]), scale), left, errors_at)
         _write(figure, left + cell_width / 2, names_at + text, name, text)
         _write(figure, left + cell_width / 2, errors_at - text, captions[name], text)
-    _write(
-        figure,
-        width / 2,
-        height - text,
-        title,
-        _text_height(width, [title], most=round(1.2 * text)),
-    )
+    size = _text_height(width, [title], most=round(1.2 * text))
+    _write(figure, width / 2, height - text, title, size)
     return png_bytes(figure, _MAPS_DPI)
 
 
 def _draw_bar(
     figure: Figure, left: int, bottom: int, height: int, text: int, *, side: int = -1
 ) -> None:
-    """Draw a vertical colour bar of errors, `text` pixels wide,
-    with labels and title on one side.
+    """Draw a vertical colour bar of errors, with labels and title on one side.
+
+    It is `text` pixels wide.
     """
     inset = text // 2  # room for half a label at either end
     length, edge = height - 2 * inset, left + text * (side > 0)
@@ -330,8 +294,7 @@ def _draw_bar(
 
 
 def error_map_picture(error_map_deg: Floats) -> Picture:
-    """Return an error map (H, W) in degrees as an RGB picture (H', W', 3) with a colour bar at its
-    right.
+    """Return an error map (H, W) in degrees as an RGB picture with a colour bar at its right.
 
     A map of fewer than 256 rows is enlarged by a whole factor while its width stays within 1024
     pixels, then padded to 256 rows.
@@ -342,11 +305,10 @@ def error_map_picture(error_map_deg: Floats) -> Picture:
     picture = colour_errors(error_map_deg)
     height, width = picture.shape[:2]
     factor = max(1, min(-(-256 // height), 1024 // width))
-    picture = picture.repeat(factor, axis=0).repeat(factor, axis=1)
+    picture = _resize(picture, factor)
     missing = max(0, 256 - len(picture))
-    picture = np.pad(
-        picture, ((missing // 2, missing - missing // 2), (0, 0), (0, 0)), constant_values=255
-    )
+    margins = ((missing // 2, missing - missing // 2), (0, 0), (0, 0))
+    picture = np.pad(picture, margins, constant_values=255)
     height = len(picture)
     text = max(18, height // 22)
     panel = Figure(figsize=(6 * text / _MAPS_DPI, height / _MAPS_DPI), dpi=_MAPS_DPI)
@@ -388,16 +350,12 @@ def calibration_picture(balls: Sequence[BallCalibration]) -> bytes:
             height, width = gray.shape
             extent = (left - 0.5, left + width - 0.5, top + height - 0.5, top - 0.5)
             axis.imshow(gray, cmap="gray", vmin=0, extent=extent)
-            axis.set(
-                xlim=(circle.x - reach, circle.x + reach), ylim=(circle.y + reach, circle.y - reach)
-            )
+            axis.set_xlim(circle.x - reach, circle.x + reach)
+            axis.set_ylim(circle.y + reach, circle.y - reach)
             axis.add_patch(Circle((circle.x, circle.y), circle.radius, fill=False, color="#5AC85A"))
-            axis.plot(
-                [circle.x, highlight.x], [circle.y, highlight.y], color="#FF3C3C", linewidth=1
-            )
-            axis.plot(
-                highlight.x, highlight.y, "o", color="#FF3C3C", markersize=6, fillstyle="none"
-            )
+            x_line, y_line, red = [circle.x, highlight.x], [circle.y, highlight.y], "#FF3C3C"
+            axis.plot(x_line, y_line, color=red, linewidth=1)
+            axis.plot(highlight.x, highlight.y, "o", color=red, markersize=6, fillstyle="none")
             axis.set_title(f"{number + 1}:  {x:+.2f} {y:+.2f} {z:+.2f}", fontsize=_SMALL)
     return png_bytes(figure, 100)
 
@@ -416,22 +374,14 @@ def _write(
     from matplotlib.transforms import IdentityTransform
 
     size, in_pixels = height / (_MAPS_DPI / 72), IdentityTransform()
-    figure.text(
-        x,
-        y,
-        words,
-        size=size,
-        ha=ha,
-        va="center",
-        rotation=rotation,
-        transform=in_pixels,
-        parse_math=False,
-    )
+    style: dict[str, Any] = {"size": size, "ha": ha, "va": "center", "rotation": rotation}
+    figure.text(x, y, words, transform=in_pixels, parse_math=False, **style)
 
 
 def _text_height(width: int, lines: Sequence[str], *, most: int = 36) -> int:
-    """Return a text height in pixels at which each line fits into the width; short lines do not
-    fill it.
+    """Return a text height in pixels at which each line fits into the width.
+
+    Short lines do not fill it.
     """
     longest = max(18, *(len(line) for line in lines))
     # characters are 0.62 of their height wide
@@ -457,8 +407,9 @@ def _resize(picture: Picture, scale: float) -> Picture:
 
 
 def _colour_normals(normals: Floats, known: Bools) -> Picture:
-    """Return the colours (n + 1) / 2 of normals (H, W, 3), white where `known` is false, even if
-    NaN is there.
+    """Return the colours (n + 1) / 2 of normals (H, W, 3), white where `known` is false.
+
+    Unknown normals may be NaN.
     """
     colours = encode_picture(np.where(known[..., None], normals, 0), known, bits=8).astype(np.uint8)
     colours[~known] = 255

@@ -21,7 +21,13 @@ from splinecli.capture.files import IMAGE_SUFFIXES
 from splinecli.capture.formats.film import is_film
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
 from splinecli.estimate.methods import Estimator, MethodOptions, method_names
-from splinecli.pipeline.distribution import SAME_STORAGE, Item, LostError, distributor, this_worker
+from splinecli.pipeline.distribution import (
+    SAME_STORAGE,
+    LostError,
+    WorkItem,
+    distributor,
+    this_worker,
+)
 from splinecli.pipeline.incoming import unpacked
 from splinecli.pipeline.infer import (
     BASE_BYTES,
@@ -34,10 +40,10 @@ from splinecli.pipeline.infer import (
 )
 from splinecli.pipeline.infer_options import HERE, ClusterOptions, InferOptions, Redo, Shard
 from splinecli.records.output_files import MAPS, NORMALS, REPORT, own_files
-from splinecli.results.files import UnfinishedError, read_report
+from splinecli.results.files import UNUSABLE, UnfinishedError, read_report
 from splinecli.results.pages import (
     INDEX,
-    Entry,
+    IndexEntry,
     check_index_free,
     has_index,
     index_page,
@@ -64,8 +70,9 @@ from splinecli.system.publishing import held_folder, is_plain
 
 @dataclass(frozen=True)
 class BatchItem:
-    """A capture of a batch. `missing` is the reason that it cannot be read if the folder does not
-    exist.
+    """A capture of a batch.
+
+    `missing` is the reason that it cannot be read if the folder does not exist.
     """
 
     folder: Path
@@ -79,10 +86,9 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[B
     Raises UsageError if images are given instead of their folder, two captures have the same name,
     or a "folder" that does not exist is the name of a map, format or method.
     """
-    are_files = (os.path.isfile(path) for path in folders)  # noqa: PTH113 - Path raises for long names
     if folders and all(
-        path.suffix.lower() in IMAGE_SUFFIXES and is_file
-        for path, is_file in zip(folders, are_files, strict=True)
+        path.suffix.lower() in IMAGE_SUFFIXES and os.path.isfile(path)  # noqa: PTH113 - Path raises for long names
+        for path in folders
     ):
         given = "an image was" if len(folders) == 1 else f"{len(folders)} images were"
         raise UsageError(
@@ -100,17 +106,18 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[B
     seen: dict[str, Path] = {}
     for folder, member in members.items():
         if member.missing is None and (other := seen.setdefault(member.name, folder)) is not folder:
-            problem = (
-                f"{other} and {folder} have the same name, so their results would overwrite"
-                " each other"
+            raise UsageError(
+                f"{other} and {folder} have the same name, so their results would overwrite each"
+                " other",
+                hint="Run them one by one with different -o",
             )
-            raise UsageError(problem, hint="Run them one by one with different -o")
     return [member for folder, member in members.items() if folder in chosen]
 
 
 def _own_path(folder: Path) -> Path:
-    """Return the same path for all spellings of a folder. A link keeps its name, because its
-    results use that name.
+    """Return the same path for all spellings of a folder.
+
+    A link keeps its name, because its results use that name.
     """
     try:
         return resolve(folder) if ".." in folder.parts else folder.absolute()
@@ -119,26 +126,29 @@ def _own_path(folder: Path) -> Path:
 
 
 def _batch_item(folder: Path) -> BatchItem:
-    """Return the capture in the folder. Raises UsageError for a value that belongs to another
-    option.
+    """Return the capture in the folder.
+
+    Raises UsageError for a value that belongs to another option.
     """
     # If a folder cannot be read, the error is reported when that capture is processed.
+    name = folder.name
     try:
         exists = find_mode(folder) is not None
+        if exists:
+            name = capture_name(folder)
     except InputError:
         exists = True
     if exists:
-        try:
-            return BatchItem(folder, capture_name(folder))
-        except InputError:
-            return BatchItem(folder, folder.name)
+        return BatchItem(folder, name)
     if str(folder) in (*MAPS, *NORMALS, *method_names()):
-        hint = "Write lists with commas, such as --maps albedo,confidence"
-        raise UsageError("the folder does not exist", path=folder, hint=hint)
+        raise UsageError(
+            "the folder does not exist",
+            path=folder,
+            hint="Write lists with commas, such as --maps albedo,confidence",
+        )
     kind = "film" if is_film(folder) else "folder"
-    return BatchItem(
-        folder, folder.name or str(folder), InputError(f"the {kind} does not exist", path=folder)
-    )
+    missing = InputError(f"the {kind} does not exist", path=folder)
+    return BatchItem(folder, name or str(folder), missing)
 
 
 Status = Literal["done", "skipped", "changed", "missing", "failed"]
@@ -146,8 +156,9 @@ Status = Literal["done", "skipped", "changed", "missing", "failed"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of one capture. `skipped` results are up to date; `changed` ones are out of date and
-    were kept.
+    """Outcome of one capture.
+
+    `skipped` results are up to date; `changed` ones are out of date and were kept.
     """
 
     status: Status
@@ -195,19 +206,25 @@ def run_member(
 
 
 def _failure(member: BatchItem, error: Exception) -> Outcome:
-    """Return the outcome of a failed capture. Raises NoRoomError, because the other captures would
-    fail, too.
+    """Return the outcome of a failed capture.
+
+    Raises NoRoomError, because the other captures would fail, too.
     """
     trace = ""
     if is_out_of_memory(error):
-        hint = "Close other programs, or use smaller images"
-        error = SplinecliError("there is not enough memory", path=member.folder, hint=hint)
+        error = SplinecliError(
+            "there is not enough memory",
+            path=member.folder,
+            hint="Close other programs, or use smaller images",
+        )
     elif isinstance(error, OSError):
         error = as_splinecli_error(error, member.folder)
     elif not isinstance(error, SplinecliError):
         trace = "".join(traceback.format_exception(error))
-        problem = f"{member.name}: {type(error).__name__}: {error}. This is a defect of splinecli"
-        error = SplinecliError(problem, hint="Please report it with the lines above")
+        error = SplinecliError(
+            f"{member.name}: {type(error).__name__}: {error}. This is a defect of splinecli",
+            hint="Please report it with the lines above",
+        )
     if isinstance(error, NoRoomError):
         raise error
     return failed(member.name, error, trace)
@@ -228,61 +245,49 @@ class ChangedError(OutputError):
 def find_earlier(
     target: Path, folder: Path, options: InferOptions, warn: Callable[[str], object]
 ) -> dict[str, Any] | None:
-    """Return the report in `target` if its results match the capture in `folder` and the options;
-    None without results.
+    """Return the report in `target` if its results match the capture and the options.
 
-    If an interrupted run left partial results, `warn` receives a sentence about this. Raises
-    ChangedError for results of another capture or other options, InputError, or OutputError if
-    `target` is also the capture's folder, where the user's own files may have the names of results.
+    Return None without results. If an interrupted run left partial results, `warn` receives a
+    sentence about this. Raises ChangedError for results of another capture or other options,
+    InputError, or OutputError if `target` is also the capture's folder, where the user's own files
+    may have the names of results.
     """
     try:
         report = read_report(target)
         earlier = InferOptions.from_dict(report["options"])
         version, stamp = report["version"], report["inputs_sha256"]
-        if Entry.of(report).row.capture != target.name:  # raises if the report is incomplete
+        if IndexEntry.of(report).row.capture != target.name:  # raises if the report is incomplete
             raise ValueError
     except UnfinishedError as error:
         found = next((name for name in own_files() if (target / name).exists()), None)
         if found is None:
             return None
         if not is_plain(target / REPORT) and target.samefile(folder):
-            problem, hint = (
-                f"contains {found}, but no {REPORT}, and is the folder of the capture",
-                "Add --overwrite",
-            )
             raise OutputError(
-                problem, path=target, hint=f"{hint}, or choose another place with -o"
+                f"contains {found}, but no {REPORT}, and is the folder of the capture",
+                path=target,
+                hint="Add --overwrite, or choose another place with -o",
             ) from None
         warn(f"{target}: {error}, so it is computed again")
         return None
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        OverflowError,
-        SplinecliError,
-    ):
+    except (*UNUSABLE, OverflowError, SplinecliError):
         made = "by another version"
     else:
         if version != __version__:
             made = f"by version {version}"
         elif names := options.changes(earlier):
-            made = (
-                f"with another {names[0]}"
-                if len(names) == 1
-                else f"with other options ({', '.join(names)})"
-            )
+            several = f"other options ({', '.join(names)})"
+            made = f"with {several if len(names) > 1 else f'another {names[0]}'}"
         elif stamp != inputs_sha256(options.open(folder), options.weights):
             made = "from other input files"
         else:
             return report
-    hint = (
-        "Add --update to redo what changed, --overwrite to redo everything, or choose another"
-        " place with -o"
+    raise ChangedError(
+        f"contains results made {made}",
+        path=target,
+        hint="Add --update to redo what changed, --overwrite to redo everything, or choose another"
+        " place with -o",
     )
-    raise ChangedError(f"contains results made {made}", path=target, hint=hint)
 
 
 def infer_batch(
@@ -294,10 +299,10 @@ def infer_batch(
     shard: Shard | None = None,
     cluster: ClusterOptions = HERE,
 ) -> Iterator[Outcome]:
-    """Run `infer_capture` on each folder and yield the outcomes, in order, or as they finish in
-    other processes.
+    """Run `infer_capture` on each folder and yield the outcomes.
 
-    With several captures, or if OUT/index.html already exists, that page is written at the end.
+    They come in order, or from other processes as they finish. With several captures, or if
+    OUT/index.html already exists, that page is written at the end.
 
     Args:
         folders: the captures. Duplicates are ignored.
@@ -320,7 +325,7 @@ def infer_batch(
     with_index = len(members) > 1 or shard is not None or has_index(output)
     if with_index:
         check_index_free(output, overwrite=redo == "all")
-    entries: dict[int, Entry] = {}
+    entries: dict[int, IndexEntry] = {}
     if cluster.address is None and not cluster.workers:
         cluster = cluster.replace(workers=choose_workers(members, options))
     outcomes: Iterable[tuple[int, Outcome]]
@@ -333,7 +338,7 @@ def infer_batch(
         )
     for number, outcome in outcomes:
         if outcome.status != "changed":
-            entries[number] = Entry.of(outcome.report)
+            entries[number] = IndexEntry.of(outcome.report)
         yield outcome
     if with_index and members:
         with held_folder(output, observer.warn, wait=True):
@@ -354,7 +359,7 @@ def _on_workers(
     weights = make_method(options.replace(device="cpu") if cluster.address else options).weights
     infer = partial(_infer, options, redo, None if weights is None else weights["sha256"])
     items = (
-        Item((n, each), str(each.folder), expected_bytes(each, options))
+        WorkItem((n, each), str(each.folder), expected_bytes(each, options))
         for n, each in enumerate(members)
     )
     with (
@@ -393,33 +398,38 @@ def _infer(
     options.check_files()
     estimator = _method(options, options.method_options, sha256)
     if member.missing is None and not os.path.lexists(member.folder):
-        problem = f"the folder does not exist on the worker {this_worker()}"
-        member = replace(member, missing=InputError(problem, path=member.folder, hint=SAME_STORAGE))
+        member = replace(
+            member,
+            missing=InputError(
+                f"the folder does not exist on the worker {this_worker()}",
+                path=member.folder,
+                hint=SAME_STORAGE,
+            ),
+        )
     observer = _Warnings()
     return run_member(member, options, redo, lambda: estimator, observer), observer.found
 
 
 @lru_cache(maxsize=1)
 def _method(options: InferOptions, method: MethodOptions, sha256: str | None) -> Estimator:
-    """Return this worker's estimator, which takes a second to load. Unlike `method`, options ignore
-    the device.
+    """Return this worker's estimator, which takes a second to load.
+
+    Unlike `method`, options ignore the device.
     """
     estimator = make_method(options)
     found = None if estimator.weights is None else estimator.weights["sha256"]
     if found != sha256:
-        problem = (
+        raise ModelError(
             f"the weights have the SHA-256 {found}, expected {sha256} as on the machine of the"
-            " command"
+            " command",
+            path=options.weights,
+            hint="Use the same file, and the same version of splinecli, everywhere",
         )
-        hint = "Use the same file, and the same version of splinecli, everywhere"
-        raise ModelError(problem, path=options.weights, hint=hint)
     return estimator
 
 
 def worst_exit_code(codes: Iterable[int]) -> int:
-    """Return the exit code of a batch: 1 for a defect of splinecli, otherwise the highest exit
-    code.
-    """
+    """Return the exit code of a batch: 1 for a defect of splinecli, otherwise the highest code."""
     found = set(codes)
     return SplinecliError.exit_code if SplinecliError.exit_code in found else max(found, default=0)
 
@@ -431,8 +441,7 @@ def expected_bytes(member: BatchItem, options: InferOptions) -> float:
 
 
 def choose_workers(members: Sequence[BatchItem], options: InferOptions) -> int:
-    """Return the number of captures that this machine can compute in parallel, given its cores and
-    its memory.
+    """Return how many captures this machine can compute in parallel with its cores and memory.
 
     A GPU computes one capture at a time.
     """

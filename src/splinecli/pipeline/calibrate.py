@@ -1,6 +1,4 @@
-"""Calibrate lights: read images of balls and of a gray target,
-and write light files and a report.
-"""
+"""Calibrate lights: images of balls and of a gray target in, light files and a report out."""
 
 import json
 from typing import Any
@@ -8,16 +6,23 @@ from typing import Any
 from splinecli.capture.channel_lights import CROSSTALK
 from splinecli.capture.light_files import read_light_directions, rows_text
 from splinecli.capture.linearise import RadiometricCalibration
-from splinecli.lights.calibration.balls import calibrate_ball, combine_balls, find_ball_files
+from splinecli.lights.calibration.balls import (
+    BallFiles,
+    CalibratedLights,
+    calibrate_ball,
+    combine_balls,
+    find_ball_files,
+)
 from splinecli.lights.calibration.circle import Circle
 from splinecli.lights.calibration.crosstalk import measure_crosstalk
 from splinecli.lights.calibration.lamps import (
     Target,
+    calibration_lines,
     calibration_report,
     measure_light_intensities,
-    summary_lines,
     triangulate_lamps,
 )
+from splinecli.maths import Float64Array
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.pictures.plots import calibration_picture
 from splinecli.pipeline.options import CalibrateOptions
@@ -30,87 +35,54 @@ DIRECTIONS, INTENSITIES = "light_directions.txt", "light_intensities.txt"
 POSITIONS, PIXEL_SIZE, CAMERA_MATRIX = "light_positions.txt", "pixel_size.txt", "camera_matrix.txt"
 PICTURE, REPORT = CALIBRATION, "calibration.json"
 OUTPUT_FILES = (
-    DIRECTIONS,
-    INTENSITIES,
-    CROSSTALK,
-    POSITIONS,
-    PIXEL_SIZE,
-    CAMERA_MATRIX,
-    PICTURE,
-    REPORT,
+    *(DIRECTIONS, INTENSITIES, CROSSTALK, POSITIONS, PIXEL_SIZE, CAMERA_MATRIX, PICTURE, REPORT),
 )
 
 
 def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
-    """Calibrate the lights, write OUTPUT_FILES and return the report. Raises InputError,
-    OutputError.
+    """Calibrate the lights, write OUTPUT_FILES and return the report.
+
+    Raises InputError, OutputError.
     """
     with held_folder(options.output, observer.warn):
         check_free(options.output, OUTPUT_FILES, overwrite=options.overwrite)
         target = options.gray_ball or options.gray_card
         # Report a wrong path now, not only after all images have been read.
         target_files = None if target is None else find_ball_files(target)
-        balls = [
-            find_ball_files(folder, mask=mask)
-            for folder, mask in zip(
-                options.balls, options.masks or [None] * len(options.balls), strict=True
-            )
-        ]
-        known = (
-            None
-            if options.compare is None
-            else read_light_directions(options.compare, len(balls[0].images))
-        )
-        circles = (
-            [Circle(*numbers) for numbers in options.circles]
-            if options.circles
-            else [None] * len(balls)
-        )
+        masks = options.masks or [None] * len(options.balls)
+        balls = [find_ball_files(*pair) for pair in zip(options.balls, masks, strict=True)]
+        known = None
+        if options.compare is not None:
+            known = read_light_directions(options.compare, len(balls[0].images))
+        circles: list[Circle | None] = [Circle(*numbers) for numbers in options.circles]
         with observer.progress("calibrating", sum(len(ball.images) for ball in balls)) as advance:
             calibrated = [
-                calibrate_ball(
-                    ball,
-                    circle=circle,
-                    camera_matrix=options.camera_matrix,
-                    progress=lambda: advance(1),
-                )
-                for ball, circle in zip(balls, circles, strict=True)
+                calibrate_ball(ball, circle, options.camera_matrix, advance)
+                for ball, circle in zip(balls, circles or [None] * len(balls), strict=True)
             ]
         lights = combine_balls(calibrated)
         intensities = crosstalk = None
         warnings: list[str] = []
         if target_files is not None:
-            radiometry = RadiometricCalibration(
-                parse_transfer(options.transfer), automatic=options.transfer == AUTOMATIC
-            )
-            radiometry, of_curve = radiometry.with_stated_curve(target_files.facts)
-            warnings += [f"{target}: {warning}" for warning in of_curve]
-            shape: Target = "ball" if options.gray_ball is not None else "card"
-            if options.lights_in_channels:
-                crosstalk = measure_crosstalk(
-                    target_files, lights.directions, radiometry=radiometry
-                )
-            else:
-                intensities = measure_light_intensities(
-                    target_files, lights.directions, shape, radiometry=radiometry
-                )
+            intensities, crosstalk, warnings = _measure_target(options, target_files, lights)
         lamps = triangulate_lamps(lights.balls, ball_diameter=options.ball_diameter)
         report = calibration_report(lights, intensities, known, picture=PICTURE, lamps=lamps)
         report["warnings"] += warnings
         report["crosstalk"] = None if crosstalk is None else crosstalk.round(6).tolist()
-        texts = {
-            DIRECTIONS: rows_text(lights.directions),
-            REPORT: json.dumps(report, indent=2) + "\n",
-        }
+        texts = {DIRECTIONS: rows_text(lights.directions)}
+        said = calibration_lines(report)
         if intensities is not None:
             texts[INTENSITIES] = rows_text(intensities)
+            said.append(f"The light intensities are in {options.output / INTENSITIES}")
         if crosstalk is not None:
             texts[CROSSTALK] = rows_text(crosstalk.reshape(-1, 3))
+            place = options.output / CROSSTALK
+            said.append(f"The crosstalk is in {place}, for infer --lights-in-channels")
         if lamps is not None and lamps.known:
-            texts |= {
-                POSITIONS: rows_text(lamps.positions),
-                PIXEL_SIZE: f"{lamps.pixel_size:.9g}\n",
-            }
+            texts[POSITIONS] = rows_text(lamps.positions)
+            texts[PIXEL_SIZE] = f"{lamps.pixel_size:.9g}\n"
+            place = options.output / POSITIONS
+            said.append(f"The positions of the lamps are in {place}, for --light-positions")
             if lamps.view.known:
                 texts[CAMERA_MATRIX] = rows_text(lamps.view.matrix)
         # Remove files that this run does not overwrite, because they belong to earlier lights.
@@ -118,19 +90,24 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
             for name, text in texts.items():
                 new.write(name, text)
             new.write(PICTURE, calibration_picture(lights.balls))
-        for line in summary_lines(report):
+            new.write(REPORT, json.dumps(report, indent=2) + "\n")
+        for line in said:
             observer.say(line)
-        if intensities is not None:
-            observer.say(f"The light intensities are in {options.output / INTENSITIES}")
-        if crosstalk is not None:
-            observer.say(
-                f"The crosstalk is in {options.output / CROSSTALK}, for infer --lights-in-channels"
-            )
-        if lamps is not None and lamps.known:
-            observer.say(
-                f"The positions of the lamps are in {options.output / POSITIONS}, for"
-                " --light-positions"
-            )
         for warning in report["warnings"]:
             observer.warn(warning)
         return report
+
+
+def _measure_target(
+    options: CalibrateOptions, files: BallFiles, lights: CalibratedLights
+) -> tuple[Float64Array | None, Float64Array | None, list[str]]:
+    """Return the light intensities or the crosstalk from images of a gray target, and warnings."""
+    radiometry, warnings = RadiometricCalibration(
+        parse_transfer(options.transfer), automatic=options.transfer == AUTOMATIC
+    ).with_stated_curve(files.facts)
+    named = [f"{files.folder}: {warning}" for warning in warnings]
+    directions = lights.directions
+    if options.lights_in_channels:
+        return None, measure_crosstalk(files, directions, radiometry=radiometry), named
+    shape: Target = "card" if options.gray_ball is None else "ball"
+    return measure_light_intensities(files, directions, shape, radiometry=radiometry), None, named

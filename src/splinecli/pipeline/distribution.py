@@ -1,5 +1,4 @@
-"""Map a function over items in other processes, either on this machine or on the workers of a Dask
-cluster.
+"""Map a function over items in other processes, on this machine or on a Dask cluster.
 
 Workers receive paths and return reports; arrays are never transferred. Dask repeats an item if its
 worker is lost.
@@ -41,11 +40,7 @@ if TYPE_CHECKING:
 
 
 # a server has to answer as a scheduler
-_CONNECT_SECONDS, _ANSWER_SECONDS, _CLOSE_SECONDS = (
-    5.0,
-    6.0,
-    5.0,
-)
+_CONNECT_SECONDS, _ANSWER_SECONDS, _CLOSE_SECONDS = (5.0, 6.0, 5.0)
 _LOOK_SECONDS = 0.5  # between two updates of the list of workers
 # item per worker: the working folder and PyTorch's threads are shared by the whole process
 _ONE_AT_A_TIME = Lock()
@@ -55,8 +50,7 @@ SAME_VERSIONS = "Install the same versions on all workers and the scheduler"
 
 @contextmanager
 def connected(options: ClusterOptions) -> Iterator[Client]:
-    """Yield a Dask client, connected to a new cluster of processes on this machine or to a running
-    cluster.
+    """Yield a Dask client of a new cluster on this machine, or of a running cluster.
 
     Raises UsageError if Dask is not installed, or no scheduler answers at the address.
     """
@@ -94,8 +88,10 @@ def _client(address: str) -> Client:
             raise ValueError(f"a {identity['type']} answers at {address}")
         return Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
     except Exception as error:
-        hint = "Start one with 'dask scheduler', and workers with 'dask worker ADDRESS'"
-        raise UsageError(f"no Dask scheduler answers at {address}", hint=hint) from error
+        raise UsageError(
+            f"no Dask scheduler answers at {address}",
+            hint="Start one with 'dask scheduler', and workers with 'dask worker ADDRESS'",
+        ) from error
 
 
 @contextmanager
@@ -109,13 +105,8 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     threads = max(1, min(threads, int(of_user)) if of_user.isdecimal() else threads)
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
     environment = dict.fromkeys(names, str(threads))
-    loggers = (
-        "distributed",
-        "distributed.client",
-        "distributed.worker",
-        "distributed.scheduler",
-        "tornado",
-    )
+    parts = ("client", "worker", "scheduler")
+    loggers = ("distributed", *(f"distributed.{part}" for part in parts), "tornado")
     settings: dict[str, Any] = {
         "distributed.nanny.pre-spawn-environ": environment,
         # No data for a dashboard, which cost processor time and an hour of memory
@@ -148,19 +139,16 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
                 dashboard_address="127.0.0.1:0",
                 silence_logs=logging.CRITICAL,
             )
-        except (
-            RuntimeError
-        ) as error:  # raised by Dask; its cause may be an error of the operating system
+        except RuntimeError as error:  # its cause may be an error of the operating system
             cause: BaseException | None = error
             while cause is not None and not isinstance(cause, OSError):
                 cause = cause.__cause__
             reason = "" if cause is None else f" ({cause.strerror or cause})"
-            problem = f"the processes of --workers cannot be started{reason}"
-            hint = (
-                "Leave --workers out, or raise the limits: each needs a temporary folder and 50"
-                " open files"
-            )
-            raise SplinecliError(problem, hint=hint) from error
+            raise SplinecliError(
+                f"the processes of --workers cannot be started{reason}",
+                hint="Leave --workers out, or raise the limits: each needs a temporary folder and"
+                " 50 open files",
+            ) from error
         try:
             yield cluster
         finally:
@@ -168,8 +156,9 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
 
 
 def _address(text: str) -> str:
-    """Return the address of a scheduler, reading the scheduler file if one is given. Raises
-    UsageError.
+    """Return the address of a scheduler, reading the scheduler file if one is given.
+
+    Raises UsageError.
     """
     from distributed.comm.registry import backends
 
@@ -179,26 +168,23 @@ def _address(text: str) -> str:
     try:
         return str(read_json(Path(text))["address"])
     except (OSError, ValueError, KeyError, TypeError):
-        problem = (
-            f"--cluster is {text}; expected an address such as tcp://scheduler:8786, or a"
-            " scheduler file"
-        )
         raise UsageError(
-            problem, hint="'dask scheduler --scheduler-file FILE' writes such a file"
+            f"--cluster is {text}; expected an address such as tcp://scheduler:8786, or a"
+            " scheduler file",
+            hint="'dask scheduler --scheduler-file FILE' writes such a file",
         ) from None
 
 
 class LostError(SplinecliError):
-    """A worker was lost, or has too little memory, so this item failed; other items may still
-    succeed.
+    """An item failed because its worker was lost or has too little memory.
+
+    Other items may still succeed.
     """
 
 
 @dataclass(frozen=True)
-class Item:
-    """The arguments of Work.do, a name for messages, and the memory in bytes that the item
-    needs.
-    """
+class WorkItem:
+    """The arguments of Work.do, a name for messages, and the memory needed in bytes."""
 
     args: tuple[Any, ...]
     name: str
@@ -221,13 +207,12 @@ class Work:
     versions: dict[str, str] = field(default_factory=_versions)  # of packages that must match
 
     def enter(self) -> None:
-        """Prepare this worker. Raises UsageError or InputError if it is incompatible with the
-        command.
+        """Prepare this worker.
+
+        Raises UsageError or InputError if it is incompatible with the command.
         """
-        for (package, expected), found in zip(
-            self.versions.items(), _versions().values(), strict=True
-        ):
-            if found != expected:
+        for package, found in _versions().items():
+            if found != (expected := self.versions[package]):
                 raise UsageError(
                     f"found {package} {found}, expected {expected} as on this machine",
                     hint=SAME_VERSIONS,
@@ -235,8 +220,11 @@ class Work:
         try:
             os.chdir(self.folder)
         except OSError as error:
-            problem = f"the folder cannot be entered ({error.strerror})"
-            raise InputError(problem, path=self.folder, hint=SAME_STORAGE) from None
+            raise InputError(
+                f"the folder cannot be entered ({error.strerror})",
+                path=self.folder,
+                hint=SAME_STORAGE,
+            ) from None
         deadline = time.monotonic() + 3.0  # a network drive may show a new file a little later
         while not (probe := Path(self.probe)).exists():
             if not probe.parent.exists() or time.monotonic() > deadline:
@@ -261,24 +249,29 @@ def _do(work: Work, *args: Any) -> Any:
             work.enter()
             return work.do(*args)
     except SplinecliError as error:
-        problem = f"{error.problem} (on the worker {this_worker()})"
-        raise type(error)(problem, path=error.path, line=error.line, hint=error.hint) from None
+        raise type(error)(
+            f"{error.problem} (on the worker {this_worker()})",
+            path=error.path,
+            line=error.line,
+            hint=error.hint,
+        ) from None
 
 
 @dataclass
 class Distributor:
-    """Assigns items to the workers of a Dask cluster, at most one at a time each. Workers may join
-    and leave.
+    """Assigns items to the workers of a Dask cluster, at most one at a time each.
+
+    Workers may join and leave.
     """
 
     client: Client
     work: Work
     options: ClusterOptions
     observer: Observer
-    running: dict[Future, Item] = field(default_factory=dict)
+    running: dict[Future, WorkItem] = field(default_factory=dict)
     _done: SimpleQueue[Future] = field(default_factory=SimpleQueue)
 
-    def run(self, items: Iterable[Item]) -> Iterator[tuple[Item, Any]]:
+    def run(self, items: Iterable[WorkItem]) -> Iterator[tuple[WorkItem, Any]]:
         """Yield each item with its result, or with a LostError, as it finishes.
 
         Raises SplinecliError, also if the scheduler was lost. The message names the worker.
@@ -302,8 +295,10 @@ class Distributor:
                 began = time.monotonic()
             # A cluster on this machine is considered lost after a minute.
             elif not self.options.address and time.monotonic() - began > 60.0:
-                hint = "If there is too little memory, use fewer. Dask's output says more"
-                raise SplinecliError("the workers stop while they start", hint=hint)
+                raise SplinecliError(
+                    "the workers stop while they start",
+                    hint="If there is too little memory, use fewer. Dask's output says more",
+                )
             while following is not None and len(self.running) < len(workers):
                 limits = (
                     _resources(info).get("MEMORY") or info.get("memory_limit")
@@ -322,11 +317,12 @@ class Distributor:
                         f"it takes about {following.memory / 1e9:.1f} GB of memory, but the"
                         " largest worker has"
                     )
-                    hint = "Start fewer workers on each machine, with more memory each"
                     yield (
                         following,
                         LostError(
-                            f"{problem} {largest / 1e9:.1f} GB", path=following.name, hint=hint
+                            f"{problem} {largest / 1e9:.1f} GB",
+                            path=following.name,
+                            hint="Start fewer workers on each machine, with more memory each",
                         ),
                     )
                 elif not used or used + following.memory <= free_memory:
@@ -338,8 +334,9 @@ class Distributor:
                 yield from self._take_result(self._done.get(timeout=_LOOK_SECONDS))
 
     def _workers(self) -> dict[str, dict[str, Any]]:
-        """Return Dask's information on the usable workers. Raises SplinecliError if the scheduler
-        is lost.
+        """Return Dask's information on the usable workers.
+
+        Raises SplinecliError if the scheduler is lost.
         """
         try:
             found = dict(self.client.scheduler_info(n_workers=-1)["workers"])
@@ -353,14 +350,14 @@ class Distributor:
             address: info for address, info in found.items() if _resources(info).get("GPU", 0) >= 1
         }
         if found and not with_gpu and not self.running:
-            hint = (
-                "Start the workers of machines with a GPU with 'dask worker ADDRESS --resources"
-                " GPU=1'"
+            raise UsageError(
+                "no worker has the Dask resource GPU",
+                hint="Start the workers of machines with a GPU with 'dask worker ADDRESS"
+                " --resources GPU=1'",
             )
-            raise UsageError("no worker has the Dask resource GPU", hint=hint)
         return with_gpu
 
-    def _submit(self, item: Item, workers: dict[str, dict[str, Any]]) -> None:
+    def _submit(self, item: WorkItem, workers: dict[str, dict[str, Any]]) -> None:
         needed = {"GPU": 1.0} if self.options.gpu else {}
         if any("MEMORY" in _resources(info) for info in workers.values()):
             needed["MEMORY"] = item.memory
@@ -374,7 +371,7 @@ class Distributor:
         self.running[future] = item
         future.add_done_callback(self._done.put)
 
-    def _take_result(self, future: Future) -> Iterator[tuple[Item, Any]]:
+    def _take_result(self, future: Future) -> Iterator[tuple[WorkItem, Any]]:
         from distributed.scheduler import KilledWorker
 
         if future.cancelled():
@@ -390,12 +387,12 @@ class Distributor:
             return
         except KilledWorker as error:
             last = getattr(error.last_worker, "address", error.last_worker)
-            problem = f"its worker was lost {error.allowed_failures + 1} times, the last one {last}"
-            hint = (
-                "If there was too little memory, start fewer workers on each machine, or"
-                " make the images smaller"
+            result = LostError(
+                f"its worker was lost {error.allowed_failures + 1} times, the last one {last}",
+                path=item.name,
+                hint="If there was too little memory, start fewer workers on each machine, or make"
+                " the images smaller",
             )
-            result = LostError(problem, path=item.name, hint=hint)
         del self.running[future]
         yield item, result
 
@@ -405,19 +402,20 @@ def _resources(info: dict[str, Any]) -> dict[str, float]:
 
 
 def _scheduler_lost() -> SplinecliError:
-    hint = "Run the same command again. It skips captures that are already done"
-    return SplinecliError("the connection to the Dask scheduler was lost", hint=hint)
+    return SplinecliError(
+        "the connection to the Dask scheduler was lost",
+        hint="Run the same command again. It skips captures that are already done",
+    )
 
 
 @contextmanager
 def distributor(
     do: Callable[..., Any], output: Path, options: ClusterOptions, observer: Observer
 ) -> Iterator[Distributor]:
-    """Yield a Distributor with a connection to its workers. Raises UsageError as `connected` does,
-    or OutputError.
+    """Yield a Distributor with a connection to its workers.
 
-    The output folder, which is created if needed, serves to check that the workers use the same
-    storage.
+    Raises UsageError as `connected` does, or OutputError. The output folder, which is created if
+    needed, serves to check that the workers use the same storage.
     """
     probe = output / f".{uuid.uuid4().hex}{UNFINISHED}"
     with ExitStack() as stack:

@@ -6,7 +6,7 @@ import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import cache, lru_cache, partial
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -30,7 +30,7 @@ from splinecli.evaluation.trials import (
     TrialStore,
     open_to_score,
 )
-from splinecli.pipeline.distribution import Item, LostError, distributor
+from splinecli.pipeline.distribution import LostError, WorkItem, distributor
 from splinecli.pipeline.infer import source_bytes
 from splinecli.pipeline.infer_options import ClusterOptions
 from splinecli.pipeline.options import EvaluateOptions
@@ -44,9 +44,7 @@ Found = TypeVar("Found")
 
 
 class EvaluateOutcome(NamedTuple):
-    """One evaluation for each protocol, the content of results.json, warnings, and what could not
-    be drawn or relit.
-    """
+    """The evaluations by protocol, results.json, warnings, and failed figures or relightings."""
 
     evaluations: list[Evaluation]
     document: dict[str, Any]
@@ -66,16 +64,10 @@ def evaluate_captures(options: EvaluateOptions, observer: Observer = SILENT) -> 
     check_writable(output)
     _check_counts(captures, protocols)
     estimators = [make_estimator(name, options.method_options) for name in options.names]
-    if options.method_options.weights is not None and not any(
-        estimator.weights for estimator in estimators
-    ):
-        names = ", ".join(estimator.name for estimator in estimators)
+    if options.weights is not None and not any(each.weights for each in estimators):
+        names = ", ".join(options.names)
         raise UsageError(f"no weights are used by {names}", hint="Leave --weights out")
-    jobs = (
-        1
-        if any(estimator.device.startswith("cuda") for estimator in estimators)
-        else count_available_cores()
-    )
+    on_gpu = any(estimator.device.startswith("cuda") for estimator in estimators)
     elsewhere: Elsewhere | None = None
     if cluster := options.cluster.on_cores():
         elsewhere = partial(
@@ -88,44 +80,35 @@ def evaluate_captures(options: EvaluateOptions, observer: Observer = SILENT) -> 
                 estimators,
                 protocols,
                 store=TrialStore(output / TRIALS, fresh=options.overwrite),
-                jobs=options.jobs or jobs,
+                jobs=options.jobs or (1 if on_gpu else count_available_cores()),
                 elsewhere=elsewhere,
                 on_progress=advance,
             )
         protocol, scored = evaluations[0].protocol, evaluations[0].captures
-        folders = {
-            name: folder for folder, name in distinct_names(captures).items() if name in scored
-        }
+        folders = {name: path for path, name in distinct_names(captures).items() if name in scored}
         figures: list[CaptureFigure] | None = None
         relit: list[RelightingReport] | None = None
         problems: list[str] = []
         if options.figures:
+            stems = file_stems(list(folders))
             draws = [
                 partial(capture_figures, folder, name, stem, estimators, protocol, options.pixels)
-                for (name, folder), stem in zip(
-                    folders.items(), file_stems(list(folders)), strict=True
-                )
+                for (name, folder), stem in zip(folders.items(), stems, strict=True)
             ]
             drawn, problems = _try_each("drawing", draws, observer)
             figures = list(chain.from_iterable(drawn))
         if options.relight:
-            pairs = [(name, estimator) for name in folders for estimator in estimators]
             tasks = [
-                partial(relight_first_draw, folders[name], name, each, protocol)
-                for name, each in pairs
+                partial(relight_first_draw, folder, name, estimator, protocol)
+                for name, folder in folders.items()
+                for estimator in estimators
             ]
             relit, failed = _try_each("relighting", tasks, observer)
             problems += failed
         document = write_results(output, evaluations, figures, relit)
-    counts = sorted(
-        {result.n_lights for evaluation in evaluations for result in evaluation.results}
-    )
-    untrained = [
-        warning
-        for estimator in estimators
-        for k in counts
-        for warning in estimator.warn_of_lights(k)
-    ]
+    counts = sorted({result.n_lights for each in evaluations for result in each.results})
+    pairs = product(estimators, counts)
+    untrained = [text for estimator, k in pairs for text in estimator.warn_of_lights(k)]
     return EvaluateOutcome(evaluations, document, untrained, problems)
 
 
@@ -133,23 +116,24 @@ def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> No
     """Raise UsageError if the number of lights exceeds the lights of every capture."""
     most = 0
     for capture in captures:
-        with suppress(
-            InputError, OSError
-        ):  # the evaluation skips the capture and reports the reason
+        # The evaluation skips the capture and reports the reason.
+        with suppress(InputError, OSError):
             most = max(most, open_capture(capture).n_lights)
     for protocol in protocols:
         if most and protocol.n_lights is not None and protocol.n_lights > most:
-            problem = (
-                f"the captures have at most {most} lights, too few for draws of {protocol.n_lights}"
+            raise UsageError(
+                f"the captures have at most {most} lights, too few for draws of"
+                f" {protocol.n_lights}",
+                hint=f"Use --n-lights {most}, or fewer",
             )
-            raise UsageError(problem, hint=f"Use --n-lights {most}, or fewer")
 
 
 def _try_each(
     label: str, tasks: Sequence[Callable[[Advance], Found]], observer: Observer
 ) -> tuple[list[Found], list[str]]:
-    """Return the results of tasks, each given the function that counts its progress, and why others
-    failed.
+    """Return the results of the tasks that succeed, and why the others failed.
+
+    Each task is given the function that counts its progress.
     """
     found: list[Found] = []
     problems: list[str] = []
@@ -170,8 +154,9 @@ def _score_on_workers(
     observer: Observer,
     draws: Sequence[DrawTask],
 ) -> Iterator[tuple[DrawTask, Scored]]:
-    """Yield the draws with their scores as they finish, one item per draw. Only this process writes
-    to the store.
+    """Yield the draws with their scores as they finish, one item per draw.
+
+    Only this process writes to the store.
 
     Raises LostError if the workers of a draw were lost, after all others were scored; or see
     Distributor.run.
@@ -179,7 +164,7 @@ def _score_on_workers(
     fingerprints = tuple((estimator.name, estimator.fingerprint) for estimator in estimators)
     score = partial(_score, uuid.uuid4().hex, fingerprints, method_options)
     memory = cache(lambda folder: source_bytes(lambda: open_capture(folder)))
-    items = (Item((draw,), draw.reading.name, memory(draw.reading.folder)) for draw in draws)
+    items = (WorkItem((draw,), draw.reading.name, memory(draw.reading.folder)) for draw in draws)
     lost: LostError | None = None
     with distributor(score, output, cluster, observer) as workers:
         for item, result in workers.run(items):
@@ -201,19 +186,17 @@ def _score(
 def _scorer(
     _command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions
 ) -> Callable[[DrawTask], Scored]:
-    """Return the function that scores draws of the worker's current command, and keeps the last
-    capture in memory.
+    """Return the function that scores draws of the worker's current command.
 
-    It is not reused by other commands, because files may change in between.
+    It keeps the last capture in memory. It is not reused by other commands, because files may
+    change in between.
     """
     estimators = {name: make_estimator(name, options) for name, _ in fingerprints}
     for name, expected in fingerprints:
         if (found := estimators[name].fingerprint) != expected:
-            problem = (
-                f"{name} is {found} here, expected {expected} as on the machine of the command"
-            )
             raise ModelError(
-                problem, hint="Use the same weight file everywhere, and the same --precision"
+                f"{name} is {found} here, expected {expected} as on the machine of the command",
+                hint="Use the same weight file everywhere, and the same --precision",
             )
     last: tuple[CaptureReading, TrialSource, Notes] | None = None
 

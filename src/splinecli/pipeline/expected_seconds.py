@@ -44,10 +44,9 @@ _ALIGN, _ALIGN_ROOT = 1.0, 7e-3  # plus this times the square root of the values
 
 def expected_seconds(
     n_pixels: int,
-    n_images: int,
     image_pixels: int,
     *,
-    n_reads: int | None = None,
+    read_pixels: int | None = None,
     network: bool = True,
     distils: bool | None = None,
     align: bool = False,
@@ -57,8 +56,8 @@ def expected_seconds(
 
     Args:
         n_pixels: number of pixels of the mask.
-        image_pixels: number of pixels of each image.
-        n_reads: number of images that are read, counting an image again each time; None for once.
+        image_pixels: number of pixels of all images together.
+        read_pixels: the same, counting an image each time that it is read; None for once.
         network: whether the method is spline-net, and not a fit.
         distils: whether a distilled estimator is used. None decides by AUTOMATIC_FROM.
         align: whether the images are aligned.
@@ -66,13 +65,17 @@ def expected_seconds(
     """
     cores = min(count_available_cores(), 8)
     costs = _BFLOAT16 if _has_bfloat16() else _FLOAT32
-    read = costs.read * image_pixels * n_images / min(cores, 2)
-    pictures = read * any(row.reads_images for row in maps)
+    read = costs.read / min(cores, 2)
+    pictures = read * image_pixels * any(row.reads_images for row in maps)
     pictures += sum(row.seconds + row.seconds_per_pixel * n_pixels for row in maps)
-    reads = costs.read * image_pixels * (n_reads or n_images) / min(cores, 2)
-    found = {"read": reads, "check": 1.5, "write": costs.write * n_pixels, "pictures": pictures}
+    found = {
+        "read": read * (read_pixels or image_pixels),
+        "check": 1.5,
+        "write": costs.write * n_pixels,
+        "pictures": pictures,
+    }
     if align:
-        found["read"] += _ALIGN + _ALIGN_ROOT * min(n_images * image_pixels, MOST_VALUES) ** 0.5
+        found["read"] += _ALIGN + _ALIGN_ROOT * min(image_pixels, MOST_VALUES) ** 0.5
     if not network:
         return {**found, "estimate": _OTHER_METHODS * n_pixels / cores}
     if n_pixels >= AUTOMATIC_FROM if distils is None else distils:

@@ -1,5 +1,6 @@
-"""Detect incoming captures once they are complete: folders of images, and films, whose frames are
-extracted.
+"""Detect captures once they are complete: folders of images, and films.
+
+The frames of films are extracted.
 """
 
 import json
@@ -17,7 +18,7 @@ from splinecli.capture.files import digest, natural_key, stamp_content
 from splinecli.capture.formats.film import FEWEST_FRAMES, choose_frames, is_film, read_frames
 from splinecli.errors import InputError, OutputError, UsageError
 from splinecli.pictures.maps import encode_png
-from splinecli.pipeline.infer_options import Reading, Redo
+from splinecli.pipeline.infer_options import ReadingOptions, Redo
 from splinecli.system.files import read_json
 from splinecli.system.progress import Observer
 from splinecli.system.publishing import held_folder, is_plain, new_files, refuse_link
@@ -29,15 +30,14 @@ _FRAME = re.compile(r"frame-\d{6,}\.png")
 
 
 def unpacked(
-    capture: Path, output: Path, reading: Reading, observer: Observer, *, redo: Redo
+    capture: Path, output: Path, reading: ReadingOptions, observer: Observer, *, redo: Redo
 ) -> Path:
-    """Return the capture; for a film, the folder in `output` with its frames, which are extracted
-    if needed.
+    """Return the capture or, for a film, the folder in `output` with its frames.
 
-    `redo` decides whether the frames of an earlier film are kept, replaced if the film differs, or
-    extracted again. Raises UsageError without --lights estimate, InputError if the film cannot be
-    read, or its light does not move, or OutputError if the folder contains frames from another
-    film, or other files, or the frames cannot be written.
+    The frames are extracted if needed. `redo` decides whether the frames of an earlier film are
+    kept, replaced if the film differs, or extracted again. Raises UsageError without --lights
+    estimate, InputError if the film cannot be read, or its light does not move, or OutputError if
+    the folder contains frames from another film, or other files, or the frames cannot be written.
     """
     if not is_film(capture):
         return capture
@@ -57,8 +57,11 @@ def unpacked(
             e.name for e in folder.iterdir() if e.name not in known and not e.name.startswith(".")
         )
         if others and (sizes or not all(map(_FRAME.fullmatch, others))):
-            problem = f"contains {others[0]}, which is not a frame of this film"
-            raise OutputError(problem, path=folder, hint="Move it, or choose another -o")
+            raise OutputError(
+                f"contains {others[0]}, which is not a frame of this film",
+                path=folder,
+                hint="Move it, or choose another -o",
+            )
         whole = all(
             is_plain(folder / name) and (folder / name).stat().st_size == sizes[name]
             for name in sizes
@@ -66,11 +69,12 @@ def unpacked(
         if of_film == stamp and whole and redo != "all":
             return folder
         if of_film not in (stamp, "") and redo == "nothing":
-            problem = "contains the frames of another film, or of an earlier version of this one"
-            hint = (
-                "Add --update to extract the frames of this film, or choose another place with -o"
+            raise OutputError(
+                "contains the frames of another film, or of an earlier version of this one",
+                path=folder,
+                hint="Add --update to extract the frames of this film, or choose another place with"
+                " -o",
             )
-            raise OutputError(problem, path=folder, hint=hint)
         with observer.progress(f"{capture.stem}: choosing frames", 1) as advance:
             numbers = choose_frames(capture)
             advance(1)
@@ -110,9 +114,7 @@ SECONDS_BETWEEN_FILES = 60.0
 
 @dataclass
 class _Seen:
-    """The contents of a capture, the time of the last change, and whether these contents were
-    returned.
-    """
+    """The contents of a capture, when they last changed, and whether they were returned."""
 
     stamp: Stamp
     since: float
@@ -158,12 +160,10 @@ class Arrivals:
         ready: dict[str, Path] = {}
         for path in captures:
             seen = self._seen.get(path)
-            recent = (
-                seen is not None and seen.returned and now - seen.looked_at < SECONDS_BETWEEN_FILES
-            )
             if (
                 seen is not None
-                and recent
+                and seen.returned
+                and now - seen.looked_at < SECONDS_BETWEEN_FILES
                 and all(_changed(place) == when for place, when in seen.folders.items())
             ):
                 continue
@@ -202,8 +202,7 @@ def _changed(folder: str) -> int:
 
 
 def _stamp(capture: Path) -> tuple[Stamp, dict[str, int]]:
-    """Return the stamp of a film, or of all files in a folder and its subfolders, and the folders;
-    see _Seen.
+    """Return the stamp of a film or of all files below a folder, and the folders; see _Seen.
 
     Files that disappear in the meantime are ignored.
     """
@@ -217,9 +216,6 @@ def _stamp(capture: Path) -> tuple[Stamp, dict[str, int]]:
                 status = os.stat(os.path.join(place, name))  # noqa: PTH116, PTH118 - thousands of files a second
             except OSError:
                 continue
-            count, size, newest = (
-                count + 1,
-                size + status.st_size,
-                max(newest, status.st_mtime_ns, status.st_ctime_ns),
-            )
+            count, size = count + 1, size + status.st_size
+            newest = max(newest, status.st_mtime_ns, status.st_ctime_ns)
     return (count, size, newest), folders

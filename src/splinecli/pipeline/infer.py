@@ -25,7 +25,7 @@ from splinecli.capture.source import BYTES_OF_RESULTS, capture_bytes
 from splinecli.errors import OutputError, SplinecliError, UsageError
 from splinecli.estimate.inference import NormalEstimate, estimate_normals, find_surface, lighting_on
 from splinecli.estimate.methods import DEFAULT_METHOD, Estimator, MethodOptions, make_estimator
-from splinecli.estimate.methods.estimator import FEWEST_PIXELS, student_sizes
+from splinecli.estimate.methods.estimator import FEWEST_TO_DISTIL, student_sizes
 from splinecli.judge.checks import check_confidence, refuse_if_strict
 from splinecli.lights.draws import draw_lights
 from splinecli.pictures.maps import encode_png
@@ -60,8 +60,8 @@ from splinecli.results.material import (
     material_warnings,
 )
 from splinecli.results.pages import result_page
-from splinecli.surface.make import make_surface
-from splinecli.surface.mesh import check_triangles
+from splinecli.surface.make import SurfaceSettings, make_surface
+from splinecli.surface.mesh import Textures, check_triangles
 from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
 from splinecli.system.files import expanded, file_sha256
 from splinecli.system.progress import SILENT, Clock, Observer
@@ -74,10 +74,7 @@ if TYPE_CHECKING:
 # for Python, PyTorch and a batch of pixels; captures and their refinement need more
 BASE_BYTES = 500 * 2**20
 # most pixels refined at once (a tile with its margin); bytes per pixel
-REFINED_PIXELS, REFINED_BYTES = (
-    736**2,
-    1100,
-)
+REFINED_PIXELS, REFINED_BYTES = (736**2, 1100)
 
 
 def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
@@ -138,7 +135,7 @@ def distil_for(
             f"method {estimator.name} does not provide confidence and cannot be distilled"
         )
     sizes = student_sizes(capture.n_pixels)
-    if sizes[0].sample < FEWEST_PIXELS:
+    if sizes[0].sample < FEWEST_TO_DISTIL:
         return refuse(f"{capture.name}: {capture.n_pixels} pixels are too few to distil")
     lighting_at = partial(lighting_on(capture), None)
     teacher = estimator.bind(lighting_at, capture.mask)
@@ -337,9 +334,8 @@ def _prepare(folder: Path, options: InferOptions, clock: Clock) -> Work:
     n_reads = images_to_read(work)
     seconds = partial(
         expected_seconds,
-        n_images=len(work.indices),
-        n_reads=n_reads,
-        image_pixels=height * width,
+        image_pixels=len(work.indices) * height * width,
+        read_pixels=n_reads * height * width,
         network=options.method.startswith(DEFAULT_METHOD),
         align=options.align,
         maps=chosen_maps(options.maps, page=options.html),
@@ -453,12 +449,9 @@ def _make_files(
             estimate.normal_map,
             capture.mask,
             camera_matrix,
-            colours,
-            gloss,
-            specular,
-            discontinuity=options.discontinuity,
-            pixel_size_mm=pixel_size,
-            progress=advance,
+            Textures(colours, gloss, specular),
+            SurfaceSettings(options.discontinuity, pixel_size),
+            advance,
         )
         formats = (*DEFAULT_FORMATS, *(("exr",) if "exr" in options.formats else ()))
         found.append(encode_surface(surface, formats))

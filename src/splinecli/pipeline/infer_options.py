@@ -1,8 +1,9 @@
-"""The options of `infer`, `watch` and `info` as frozen records, which can be pickled and converted
-to JSON.
+"""The options of `infer`, `watch` and `info` as frozen records.
+
+They can be pickled and converted to JSON.
 """
 
-# The options form a table: name, type, panel and kind of value, then the help text.
+# The options form a table: name and type, then panel, help text and kind of value.
 from __future__ import annotations
 
 import dataclasses
@@ -12,11 +13,11 @@ import re
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
-from msgspec import Meta
+from msgspec import NODEFAULT, Meta
 
-from splinecli.capture import CaptureSource, RadiometricCalibration, open_capture
+from splinecli.capture import CaptureOptions, CaptureSource, RadiometricCalibration, open_capture
 from splinecli.capture.files import check_not_empty, list_images
 from splinecli.capture.formats.numbers import to_number
 from splinecli.capture.light_files import light_suffixes
@@ -24,12 +25,7 @@ from splinecli.capture.light_rows import EXCHANGED, LightForm, parse_light_frame
 from splinecli.capture.linearise import parse_window
 from splinecli.capture.near_lamps import LampOptions
 from splinecli.capture.reader import EQUAL
-from splinecli.capture.record import (
-    ESTIMATE,
-    SIDES_DEG,
-    azimuth_of,
-    check_light_indices,
-)
+from splinecli.capture.record import ESTIMATE, SIDES_DEG, azimuth_of, check_light_indices
 from splinecli.errors import UsageError
 from splinecli.estimate.methods import DEFAULT_METHOD, MethodOptions, check_method, method_names
 from splinecli.images.alignment import MIN_IMAGES
@@ -38,7 +34,16 @@ from splinecli.maths.robust import MIN_LIGHTS
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.recipe.work import RecipeOptions
 from splinecli.records import base as records
-from splinecli.records.base import FileName, NotNegative, Option, Positive, Record, Seed
+from splinecli.records.base import (
+    FileName,
+    NotNegative,
+    Option,
+    Positive,
+    Record,
+    Seed,
+    flag,
+    option,
+)
 from splinecli.records.output_files import MAPS, NORMALS
 from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.surface_files import check_exr
@@ -52,8 +57,9 @@ SMALLEST_PIXEL_MM, LARGEST_PIXEL_MM = 1e-6, 1e6
 
 
 def complete_weights() -> list[str]:
-    """Return the names of the shipped weights. If none starts with the typed text, the shell
-    completes file names.
+    """Return the names of the shipped weights.
+
+    If none starts with the typed text, the shell completes file names.
     """
     # The module that usually reads this file imports torch, which is too slow for shell completion.
     return list(
@@ -62,7 +68,8 @@ def complete_weights() -> list[str]:
 
 
 CURVES = ("auto", "linear", "srgb", "gamma:2.2")  # the last is an example
-OUTPUT = ("--output", "-o")
+OUTPUT = "--output -o"
+LEAVE_ONE = "Leave one out"
 MASK_IMAGE = "Mask image, white on the {} (above half of its largest value)."
 DISCONTINUITY_HELP = "Discontinuity sensitivity of the surface; 0 gives a continuous surface."
 
@@ -70,60 +77,54 @@ AsStored = Annotated[
     bool,
     Option(
         "Input",
-        "",
         "Use the stored values: do not remove lens blur, restore saturated pixels or estimate"
         " light intensities.",
     ),
 ]
-WhiteLevel = Annotated[
+GivenWhiteLevel = Annotated[
     Positive | None,
     Option(
         "Input",
-        "N",
         "Stored value from which a pixel is considered saturated.",
-        default="found in the images",
+        "N",
+        "found in the images",
     ),
 ]
-RandomSeed = Annotated[Seed, Option("Lights", "S", "Seed of the random draws.")]
+RandomSeed = Annotated[Seed, Option("Lights", "Seed of the random draws.", "S")]
 RefineLights = Annotated[
-    bool, Option("Lights", "", "Refine rough light directions so that they fit the images better.")
+    bool, Option("Lights", "Refine rough light directions so that they fit the images better.")
 ]
 Weights = Annotated[
     str | None,
     Option(
         "Method",
-        "NAME|FILE",
         "Weights: a shipped name or a file.",
-        default="the method's own",
+        "NAME|FILE",
+        "the method's own",
         complete=complete_weights,
     ),
 ]
 DeviceName = Annotated[
     Device,
-    Option("Speed", "", "Device to compute on. auto is a CUDA GPU if there is one, else the CPU."),
+    Option("Speed", "Device to compute on. auto is a CUDA GPU if there is one, else the CPU."),
 ]
 PrecisionName = Annotated[
     Precision,
-    Option(
-        "Speed", "", "Number format. auto is bfloat16 if the hardware supports it, else float32."
-    ),
+    Option("Speed", "Number format. auto is bfloat16 if the hardware supports it, else float32."),
 ]
-Quiet = Annotated[bool, Option("Output", "", "Print nothing but errors.", names=("--quiet", "-q"))]
-Overwrite = Annotated[bool, Option("Output", "", "Replace earlier results.")]
+Quiet = Annotated[bool, Option("Output", "Print nothing but errors.", names="--quiet -q")]
+Overwrite = Annotated[bool, Option("Output", "Replace earlier results.")]
 Update = Annotated[
-    bool, Option("Output", "", "Compute changed captures again, and skip those that are done.")
+    bool, Option("Output", "Compute changed captures again, and skip those that are done.")
 ]
 
 
 class Display(Record, frozen=True, kw_only=True):
     """The output that a command prints."""
 
-    as_json: Annotated[
-        bool,
-        Option(
-            "Output", "", "Print one JSON document on stdout, and nothing else.", names=("--json",)
-        ),
-    ] = False
+    as_json: bool = flag(
+        "Output", "Print one JSON document on stdout, and nothing else.", names="--json"
+    )
     quiet: Quiet = False
 
 
@@ -134,51 +135,39 @@ def parse_workers(text: str) -> int:
     return 0 if text == "auto" else int(text)
 
 
-class Workers(Record, frozen=True, kw_only=True):
-    """The number of local processes that work on the items of a command; 0 means as many as the
-    machine can use.
+class WorkerOptions(Record, frozen=True, kw_only=True):
+    """The number of local processes for the items of a command.
+
+    0 means as many as the machine can use.
     """
 
-    workers: Annotated[
-        int,
-        Option(
-            "Processes and machines",
-            "N|auto",
-            "Number of parallel processes on this machine (needs the extra 'cluster'). auto"
-            " chooses by cores and memory.",
-            parse=parse_workers,
-        ),
-    ] = 1
+    workers: int = option(
+        "Processes and machines",
+        "Number of parallel processes on this machine (needs the extra 'cluster'). auto"
+        " chooses by cores and memory.",
+        "N|auto",
+        value=1,
+        parse=parse_workers,
+    )
 
 
-class ClusterOptions(Workers, frozen=True, kw_only=True):
-    """Where the items of a command are processed: in this process, in other local processes, or on
-    a Dask cluster.
-    """
+class ClusterOptions(WorkerOptions, frozen=True, kw_only=True):
+    """Where the items of a command are processed: here, in other processes, or on a cluster."""
 
     # the address or the scheduler file of a Dask scheduler
-    address: Annotated[
-        str | None,
-        Option(
-            "Processes and machines",
-            "ADDRESS|FILE",
-            "Compute on the workers of a running Dask cluster: the address of its scheduler, or"
-            " its scheduler file (needs"
-            " the extra 'cluster').",
-            names=("--cluster",),
-        ),
-    ] = None
+    address: str | None = option(
+        "Processes and machines",
+        "Compute on the workers of a running Dask cluster: the address of its scheduler, or"
+        " its scheduler file (needs the extra 'cluster').",
+        "ADDRESS|FILE",
+        names="--cluster",
+    )
     gpu: bool = False  # whether only workers with the Dask resource GPU are used
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.address is not None and self.workers != 1:
-            hint = "Leave --workers out: the cluster has workers of its own"
-            raise UsageError("--workers and --cluster contradict each other", hint=hint)
+    CONFLICTS = (("workers", "address", "Leave --workers out: the cluster has workers of its own"),)
 
     def on_cores(self, n_items: int | None = None) -> ClusterOptions | None:
-        """Return these options with 0 replaced by one process per core, limited to one process per
-        item.
+        """Return these options with one process per core instead of 0, at most one per item.
 
         Return None if other processes would not be faster than this one.
         """
@@ -193,235 +182,155 @@ class ClusterOptions(Workers, frozen=True, kw_only=True):
 HERE = ClusterOptions()
 
 
-class Reading(Record, frozen=True, kw_only=True):
+class ReadingOptions(Record, frozen=True, kw_only=True):
     """The options of `infer` and `info` that select the files of a capture and how to read them.
 
     The help describes each option. None stands for the default given there. Raises UsageError.
     """
 
-    mask: Annotated[
-        FileName | None,
-        Option(
-            "Input",
-            "FILE",
-            MASK_IMAGE.format("object"),
-            default="a file named mask.*, or all pixels",
-        ),
-    ] = None
-    crop: Annotated[
-        str | None,
-        Option(
-            "Input",
-            "X,Y,W,H",
-            "Read this box of the images: upper left corner and size, in pixels.",
-        ),
-    ] = None
-    scale: Annotated[
-        str | None,
-        Option("Input", "1/N", "Read every N-th row and column, for a first look.", default="all"),
-    ] = None
-    align: Annotated[
-        bool,
-        Option(
-            "Input",
-            "",
-            "Align the images to the first one, if they were shifted, rotated or zoomed between"
-            " exposures.",
-        ),
-    ] = False
-    ground_truth: Annotated[
-        FileName | None,
-        Option("Input", "FILE", "True normals to compare with (.mat, .npy, text, PNG, TIFF)."),
-    ] = None
-    transfer: Annotated[
-        str,
-        Option(
-            "Input",
-            "CURVE",
-            "Transfer curve of the images: auto, linear, srgb or gamma:G. auto follows the files,"
-            " and reads JPEG as sRGB.",
-            complete=CURVES,
-        ),
-    ] = AUTOMATIC
-    ambient: Annotated[
-        FileName | None,
-        Option(
-            "Input",
-            "FILE",
-            "Image taken without the lights, to subtract from all images.",
-            default="ambient.*",
-        ),
-    ] = None
-    flat_field: Annotated[
-        FileName | None,
-        Option(
-            "Input",
-            "DIR",
-            "Folder with images of a uniform white surface: one for all lights, or one for each"
-            " light.",
-        ),
-    ] = None
-    white_level: WhiteLevel = None
-    lights: Annotated[
-        FileName | None,
-        Option(
-            "Lights",
-            "FILE|estimate",
-            f"Light directions ({light_suffixes()}): x y z for each image, z to the camera."
-            " estimate derives them from the"
-            " images, less accurately than a calibration.",
-            default="the light file in CAPTURE",
-        ),
-    ] = None
-    first_light: Annotated[
-        str | None,
-        Option(
-            "Lights",
-            "SIDE|DEGREES",
-            "With --lights estimate: the side that the first light comes from, such as left, above"
-            " or upper-left, or its"
-            " azimuth, counter-clockwise from the right. Needed if the images show no outline of"
-            " the object.",
-            complete=tuple(SIDES_DEG),
-        ),
-    ] = None
-    light_frame: Annotated[
-        str | None,
-        Option(
-            "Lights",
-            "LIST",
-            f"Frame of the light file: any of x-left, y-down, z-away and {EXCHANGED} (y comes"
-            " before x).",
-            default="x right, y up, z to the camera",
-            complete=records.complete_list(("x-left", "y-down", "z-away", EXCHANGED)),
-        ),
-    ] = None
-    light_format: Annotated[
-        LightForm,
-        Option(
-            "Lights",
-            "",
-            "Form of a light in a text file: xyz, a vector; azel, azimuth and elevation; or"
-            " slant-tilt, the angles of"
-            " HALCON. Angles are in degrees.",
-        ),
-    ] = "xyz"
-    intensities: Annotated[
-        FileName | None,
-        Option(
-            "Lights",
-            "FILE|equal",
-            "Light intensities: a line r g b for each image.",
-            default="equal, or estimated if the images show that they differ",
-        ),
-    ] = None
-    lights_in_channels: Annotated[
-        bool,
-        Option(
-            "Lights",
-            "",
-            "The channels of each colour image are photographs under three coloured lamps; the"
-            " light file has three lights"
-            " for each image, in the order R, G, B. For gray objects.",
-        ),
-    ] = False
-    crosstalk: Annotated[
-        FileName | None,
-        Option(
-            "Lights",
-            "FILE",
-            "With --lights-in-channels: 3 x 3 responses to the lamps, one line for each of the"
-            " channels R, G, B.",
-            default="crosstalk.txt in CAPTURE, or none",
-        ),
-    ] = None
-    light_positions: Annotated[
-        FileName | None,
-        Option(
-            "Lights",
-            "FILE",
-            "Near lamps: a line x y z for each image, in any unit, from the middle of the image.",
-            default="light_positions.txt in CAPTURE",
-        ),
-    ] = None
-    light_distance: Annotated[
-        Positive | None,
-        Option(
-            "Lights", "D", "Near lamps: the distance of all lamps from the middle of the object."
-        ),
-    ] = None
-    pixel_size: Annotated[
-        Positive | None,
-        Option(
-            "Lights",
-            "S",
-            "Near lamps: the width of a pixel on the object.",
-            default="pixel_size.txt in CAPTURE",
-        ),
-    ] = None
-    object_width: Annotated[
-        Positive | None,
-        Option(
-            "Lights",
-            "W",
-            "Near lamps: the width of the object in its mask, instead of --pixel-size.",
-        ),
-    ] = None
-    camera_matrix: Annotated[
-        FileName | None,
-        Option(
-            "Lights",
-            "FILE",
-            "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera: each pixel"
-            " is then estimated in the"
-            " frame of its viewing ray.",
-            default="camera_matrix.txt in CAPTURE, or orthographic",
-        ),
-    ] = None
-    strict: Annotated[
-        bool,
-        Option(
-            "Output",
-            "",
-            "Fail with exit code 3 if the lights or the images are probably wrong, instead of"
-            " warning.",
-        ),
-    ] = False
+    mask: FileName | None = option(
+        "Input", MASK_IMAGE.format("object"), "FILE", "a file named mask.*, or all pixels"
+    )
+    crop: str | None = option(
+        "Input", "Read this box of the images: upper left corner and size, in pixels.", "X,Y,W,H"
+    )
+    scale: str | None = option(
+        "Input", "Read every N-th row and column, for a first look.", "1/N", "all"
+    )
+    align: bool = flag(
+        "Input",
+        "Align the images to the first one, if they were shifted, rotated or zoomed between"
+        " exposures.",
+    )
+    ground_truth: FileName | None = option(
+        "Input", "True normals to compare with (.mat, .npy, text, PNG, TIFF).", "FILE"
+    )
+    transfer: str = option(
+        "Input",
+        "Transfer curve of the images: auto, linear, srgb or gamma:G. auto follows the files,"
+        " and reads JPEG as sRGB.",
+        "CURVE",
+        value=AUTOMATIC,
+        complete=CURVES,
+    )
+    ambient: FileName | None = option(
+        "Input", "Image taken without the lights, to subtract from all images.", "FILE", "ambient.*"
+    )
+    flat_field: FileName | None = option(
+        "Input",
+        "Folder with images of a uniform white surface: one for all lights, or one for each light.",
+        "DIR",
+    )
+    white_level: GivenWhiteLevel = None
+    lights: FileName | None = option(
+        "Lights",
+        f"Light directions ({light_suffixes()}): x y z for each image, z to the camera."
+        " estimate derives them from the images, less accurately than a calibration.",
+        "FILE|estimate",
+        "the light file in CAPTURE",
+    )
+    first_light: str | None = option(
+        "Lights",
+        "With --lights estimate: the side that the first light comes from, such as left, above"
+        " or upper-left, or its azimuth, counter-clockwise from the right. Needed if the"
+        " images show no outline of the object.",
+        "SIDE|DEGREES",
+        complete=tuple(SIDES_DEG),
+    )
+    light_frame: str | None = option(
+        "Lights",
+        f"Frame of the light file: any of x-left, y-down, z-away and {EXCHANGED} (y comes"
+        " before x).",
+        "LIST",
+        "x right, y up, z to the camera",
+        complete=records.complete_list(("x-left", "y-down", "z-away", EXCHANGED)),
+    )
+    light_format: LightForm = option(
+        "Lights",
+        "Form of a light in a text file: xyz, a vector; azel, azimuth and elevation; or"
+        " slant-tilt, the angles of HALCON. Angles are in degrees.",
+        value="xyz",
+    )
+    intensities: FileName | None = option(
+        "Lights",
+        "Light intensities: a line r g b for each image.",
+        "FILE|equal",
+        "equal, or estimated if the images show that they differ",
+    )
+    lights_in_channels: bool = flag(
+        "Lights",
+        "The channels of each colour image are photographs under three coloured lamps; the"
+        " light file has three lights for each image, in the order R, G, B. For gray objects.",
+    )
+    crosstalk: FileName | None = option(
+        "Lights",
+        "With --lights-in-channels: 3 x 3 responses to the lamps, one line for each of the"
+        " channels R, G, B.",
+        "FILE",
+        "crosstalk.txt in CAPTURE, or none",
+    )
+    light_positions: FileName | None = option(
+        "Lights",
+        "Near lamps: a line x y z for each image, in any unit, from the middle of the image.",
+        "FILE",
+        "light_positions.txt in CAPTURE",
+    )
+    light_distance: Positive | None = option(
+        "Lights", "Near lamps: the distance of all lamps from the middle of the object.", "D"
+    )
+    pixel_size: Positive | None = option(
+        "Lights",
+        "Near lamps: the width of a pixel on the object.",
+        "S",
+        "pixel_size.txt in CAPTURE",
+    )
+    object_width: Positive | None = option(
+        "Lights", "Near lamps: the width of the object in its mask, instead of --pixel-size.", "W"
+    )
+    camera_matrix: FileName | None = option(
+        "Lights",
+        "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera: each pixel"
+        " is then estimated in the frame of its viewing ray.",
+        "FILE",
+        "camera_matrix.txt in CAPTURE, or orthographic",
+    )
+    strict: bool = flag(
+        "Output",
+        "Fail with exit code 3 if the lights or the images are probably wrong, instead of warning.",
+    )
     # whether a surface, in the unit of pixel_size, is also computed; a field of InferOptions
     surface = False
 
+    CONFLICTS: ClassVar[records.Conflicts] = (("lights_in_channels", "align", LEAVE_ONE),)
+
     def __post_init__(self) -> None:
         super().__post_init__()
-        # These options apply to a light file or to near lamps.
-        reasons = {
-            "--light-positions": self.light_positions is not None and "finds distant lights",
-            "--light-distance": self.light_distance is not None and "finds distant lights",
-            "--light-frame": self.light_frame is not None and "needs no light file",
-            "--light-format": self.light_format != "xyz" and "needs no light file",
-        }
-        for option, reason in reasons.items():
-            if self.finds_lights and reason:
-                problem = f"--lights estimate {reason}, so it contradicts {option}"
-                raise UsageError(problem, hint=f"Leave {option} out, or give a light file")
+        # These options apply to near lamps or to a light file.
+        near, of_file = "finds distant lights", "needs no light file"
+        for name, given, reason in (
+            ("--light-positions", self.light_positions is not None, near),
+            ("--light-distance", self.light_distance is not None, near),
+            ("--light-frame", self.light_frame is not None, of_file),
+            ("--light-format", self.light_format != "xyz", of_file),
+        ):
+            if self.finds_lights and given:
+                raise UsageError(
+                    f"--lights estimate {reason}, so it contradicts {name}",
+                    hint=f"Leave {name} out, or give a light file",
+                )
+        add_it = "Add it, or leave both out"
         if self.crosstalk is not None and not self.lights_in_channels:
-            raise UsageError(
-                "--crosstalk needs --lights-in-channels", hint="Add it, or leave both out"
-            )
+            raise UsageError("--crosstalk needs --lights-in-channels", hint=add_it)
         if self.align and self.scale is not None:
-            problem = "--align needs every row and column, so it contradicts --scale"
-            raise UsageError(problem, hint="Leave one out, or use --crop for a first look")
-        if self.lights_in_channels and self.align:
             raise UsageError(
-                "--lights-in-channels and --align contradict each other", hint="Leave one out"
-            )
-        if self.first_light is not None and not self.finds_lights:
-            raise UsageError(
-                "--first-light needs --lights estimate", hint="Add it, or leave both out"
+                "--align needs every row and column, so it contradicts --scale",
+                hint="Leave one out, or use --crop for a first look",
             )
         if self.first_light is not None:
+            if not self.finds_lights:
+                raise UsageError("--first-light needs --lights estimate", hint=add_it)
             azimuth_of(self.first_light)
-        _ = self.lamps, parse_window(self.crop, self.scale)
-        parse_transfer(self.transfer)
+        _ = self.lamps, parse_window(self.crop, self.scale), parse_transfer(self.transfer)
         if "exchanged" in (self.light_frame or ""):  # its name in earlier versions
             raise UsageError(f"--light-frame is {self.light_frame!r}; exchanged is now {EXCHANGED}")
         parse_light_frame(self.light_frame)
@@ -449,19 +358,12 @@ class Reading(Record, frozen=True, kw_only=True):
         )
 
     def check_files(self) -> None:
-        """Raise InputError if a file named in the options does not exist, or --flat-field contains
-        no images.
-        """
+        """Raise InputError if a file is missing, or the folder of --flat-field has no images."""
         intensities = None if self.intensities == EQUAL else self.intensities
-        named = (
-            self.light_file,
-            self.light_positions,
-            intensities,
-            self.camera_matrix,
-            self.mask,
-            self.crosstalk,
-        )
-        for name in (*named, self.ground_truth, self.ambient):
+        for name in (
+            *(self.light_file, self.light_positions, intensities, self.camera_matrix),
+            *(self.mask, self.crosstalk, self.ground_truth, self.ambient),
+        ):
             if name is not None:
                 check_file(Path(name), "a file", pipe=name == self.light_file)
         self.radiometric_calibration()
@@ -474,9 +376,8 @@ class Reading(Record, frozen=True, kw_only=True):
             flats = tuple(list_images(folder, leave_out_stems=("ambient", "mask"), leave_out=()))
             check_not_empty(flats, folder)
         dark = None if self.ambient is None else Path(self.ambient)
-        return RadiometricCalibration(
-            parse_transfer(self.transfer), dark, flats, self.transfer == AUTOMATIC
-        )
+        automatic = self.transfer == AUTOMATIC
+        return RadiometricCalibration(parse_transfer(self.transfer), dark, flats, automatic)
 
     @property
     def recipe(self) -> RecipeOptions:
@@ -492,147 +393,130 @@ class Reading(Record, frozen=True, kw_only=True):
         """Open the capture in the folder with these options. Raises InputError."""
         return open_capture(
             folder,
-            lights=self.light_file,
-            intensities=self.intensities,
-            mask=self.mask,
-            ground_truth=self.ground_truth,
-            radiometry=self.radiometric_calibration(),
-            white_level=self.white_level,
-            light_frame=parse_light_frame(self.light_frame),
-            lights_format=self.light_format,
-            lamps=self.lamps,
-            window=parse_window(self.crop, self.scale),
-            needs_lights=not self.finds_lights,
-            lights_in_channels=self.lights_in_channels,
-            crosstalk=self.crosstalk,
+            CaptureOptions(
+                lights=self.light_file,
+                intensities=self.intensities,
+                mask=self.mask,
+                ground_truth=self.ground_truth,
+                radiometry=self.radiometric_calibration(),
+                white_level=self.white_level,
+                light_frame=parse_light_frame(self.light_frame),
+                light_format=self.light_format,
+                lamps=self.lamps,
+                window=parse_window(self.crop, self.scale),
+                needs_lights=not self.finds_lights,
+                lights_in_channels=self.lights_in_channels,
+                crosstalk=self.crosstalk,
+            ),
         )
 
 
-class InferOptions(Reading, frozen=True, kw_only=True):
-    """The options of `infer`; see its help. Raises UsageError if a value is invalid or two options
-    conflict.
+def parse_indices(text: str, title: str) -> tuple[int, ...]:
+    """Return the integers in a text such as "0,5,12". Raises UsageError."""
+    try:
+        return tuple(int(item) for item in text.split(","))
+    except ValueError:
+        raise UsageError(
+            f"{title} is {text!r}; expected zero-based numbers such as 0,5,12"
+        ) from None
+
+
+class InferOptions(ReadingOptions, frozen=True, kw_only=True):
+    """The options of `infer`; see its help.
+
+    Raises UsageError if a value is invalid or two options conflict.
     """
 
     # The defaults follow. light_indices are zero-based. map_scales are names of maps and the values
     # shown as white, if they are not those of the rows in MAPS.
-    auto_mask: Annotated[
-        bool,
-        Option(
-            "Input",
-            "",
-            "If there is no mask, find the object in the images and write found_mask.png.",
-        ),
-    ] = False
+    auto_mask: bool = flag(
+        "Input", "If there is no mask, find the object in the images and write found_mask.png."
+    )
     as_stored: AsStored = False
     refine_lights: RefineLights = False
-    pixel_size: Annotated[
-        Positive | None,
-        Option(
-            "Lights",
-            "S",
-            "Near lamps: the width of a pixel on the object, in the unit of the lamps."
-            " With --surface: in millimetres, for"
-            " a surface in millimetres.",
-            default="pixel_size.txt in CAPTURE",
-        ),
-    ] = None
-    n_lights: Annotated[
-        Annotated[int, Meta(ge=MIN_LIGHTS)] | None,
-        Option("Lights", "K", "Use K lights drawn at random.", default="all"),
-    ] = None
+    pixel_size: Positive | None = option(
+        "Lights",
+        "Near lamps: the width of a pixel on the object, in the unit of the lamps. With"
+        " --surface: in millimetres, for a surface in millimetres.",
+        "S",
+        "pixel_size.txt in CAPTURE",
+    )
+    n_lights: Annotated[int, Meta(ge=MIN_LIGHTS)] | None = option(
+        "Lights", "Use K lights drawn at random.", "K", "all"
+    )
     seed: RandomSeed = 0
-    light_indices: Annotated[
-        tuple[int, ...] | None,
-        Option(
-            "Lights",
-            "I,J,...",
-            "Use these lights, counted from 0. Plots and warnings count from 1.",
-            parse=partial(parse_indices, option="--light-indices"),
-        ),
-    ] = None
-    method: Annotated[
-        str,
-        Option(
-            "Method",
-            "METHOD",
-            f"Method to use: {records.listed(method_names())}.",
-            complete=method_names(),
-        ),
-    ] = DEFAULT_METHOD
+    light_indices: tuple[int, ...] | None = option(
+        "Lights",
+        "Use these lights, counted from 0. Plots and warnings count from 1.",
+        "I,J,...",
+        parse=partial(parse_indices, title="--light-indices"),
+    )
+    method: str = option(
+        "Method",
+        f"Method to use: {records.listed(method_names())}.",
+        "METHOD",
+        value=DEFAULT_METHOD,
+        complete=method_names(),
+    )
     weights: Weights = None
-    distil: Annotated[
-        bool | None,
-        Option(
-            "Speed",
-            "",
-            "Approximate the network with a smaller one, trained on a sample of the capture's"
-            " pixels, or use the method on"
-            " every pixel.",
-            default="--distil from 100,000 pixels, else --exact",
-            names=("--distil/--exact",),
-        ),
-    ] = None
+    distil: bool | None = option(
+        "Speed",
+        "Approximate the network with a smaller one, trained on a sample of the capture's"
+        " pixels, or use the method on every pixel.",
+        default="--distil from 100,000 pixels, else --exact",
+        names="--distil/--exact",
+    )
     device: DeviceName = "auto"
     precision: PrecisionName = "auto"
-    output: Annotated[
-        FileName, Option("Output", "OUT", "Write results to OUT/<capture name>/.", names=OUTPUT)
-    ] = "out"
-    formats: Annotated[
-        tuple[str, ...],
-        Option(
-            "Output",
-            "LIST",
-            f"Files of the normal map: any of {records.listed(NORMALS)}. png has 16 bits, png8 has"
-            " 8, npy and tiff are"
-            " float32. With exr (needs the extra 'exr'), albedo and depth are written as EXR, too.",
-            names=("--format",),
-            items=NORMALS,
-        ),
-    ] = ("png", "npy")
-    maps: Annotated[
-        tuple[str, ...],
-        Option(
-            "Output",
-            "LIST",
-            f"Further maps to write: any of {records.listed(MAPS)}. preview is a shaded image."
-            " relief:2 makes heights"
-            " of 2 pixels white in the picture, and curvature:0.1 a mean curvature of 0.1 per"
-            " pixel.",
-            items=MAPS,
-        ),
-    ] = ()
+    output: FileName = option(
+        "Output", "Write results to OUT/<capture name>/.", "OUT", value="out", names=OUTPUT
+    )
+    formats: tuple[str, ...] = option(
+        "Output",
+        f"Files of the normal map: any of {records.listed(NORMALS)}. png has 16 bits, png8 has"
+        " 8, npy and tiff are float32. With exr (needs the extra 'exr'), albedo and depth are"
+        " written as EXR, too.",
+        "LIST",
+        value=("png", "npy"),
+        names="--format",
+        items=NORMALS,
+    )
+    maps: tuple[str, ...] = option(
+        "Output",
+        f"Further maps to write: any of {records.listed(MAPS)}. preview is a shaded image."
+        " relief:2 makes heights of 2 pixels white in the picture, and curvature:0.1 a mean"
+        " curvature of 0.1 per pixel.",
+        "LIST",
+        value=(),
+        items=MAPS,
+    )
     map_scales: tuple[tuple[str, Positive], ...] = ()
-    html: Annotated[
-        bool,
-        Option("Output", "", "Also write page.html for interactive relighting, with all maps."),
-    ] = False
-    surface: Annotated[
-        bool,
-        Option(
-            "Output",
-            "",
-            "Also write mesh.glb, mesh.ply, and depth.npy, .tiff and .png, as integrate does.",
-        ),
-    ] = False
-    discontinuity: Annotated[NotNegative, Option("Output", "K", DISCONTINUITY_HELP)] = DISCONTINUITY
-    convention: Annotated[
-        Convention,
-        Option("Output", "", "Green channel of the PNG files: opengl is y up, directx is y down."),
-    ] = "opengl"
+    html: bool = flag("Output", "Also write page.html for interactive relighting, with all maps.")
+    surface: bool = flag(
+        "Output", "Also write mesh.glb, mesh.ply, and depth.npy, .tiff and .png, as integrate does."
+    )
+    discontinuity: NotNegative = option("Output", DISCONTINUITY_HELP, "K", value=DISCONTINUITY)
+    convention: Convention = option(
+        "Output",
+        "Green channel of the PNG files: opengl is y up, directx is y down.",
+        value="opengl",
+    )
+
+    CONFLICTS = (
+        *ReadingOptions.CONFLICTS,
+        ("n_lights", "light_indices", LEAVE_ONE),
+        ("mask", "auto_mask", LEAVE_ONE),
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.n_lights is not None and self.light_indices is not None:
-            raise UsageError(
-                "--n-lights and --light-indices contradict each other", hint="Leave one out"
-            )
         count = self.n_lights if self.light_indices is None else len(self.light_indices)
         if self.align and count is not None and count < MIN_IMAGES:
-            option = "--n-lights" if self.light_indices is None else "--light-indices"
-            problem = f"{option} leaves {count} images, but --align needs at least {MIN_IMAGES}"
-            raise UsageError(problem, hint="Use more lights, or leave --align out")
-        if self.mask is not None and self.auto_mask:
-            raise UsageError("--mask and --auto-mask contradict each other", hint="Leave one out")
+            name = "--n-lights" if self.light_indices is None else "--light-indices"
+            raise UsageError(
+                f"{name} leaves {count} images, but --align needs at least {MIN_IMAGES}",
+                hint="Use more lights, or leave --align out",
+            )
         if self.finds_lights and self.refine_lights:
             raise UsageError(
                 "--lights estimate refines the lights that it finds",
@@ -649,19 +533,18 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         """See Record. --maps also sets scales, and the seed only applies if the lights are drawn at
         random.
         """
-        scales, names = [], []
-        scaled = [row.name for row in MAPS.values() if row.scale is not None]
-        for item in (given["maps"] or "").split(","):
-            name, colon, scale = (part.strip() for part in item.partition(":"))
-            names.append(name)
-            if colon:
-                if name not in scaled or not 0 < (to_number(scale) or 0) < math.inf:
-                    expected = " or ".join(f"{name}:NUMBER" for name in scaled)
-                    raise UsageError(
-                        f"--maps has {item.strip()!r}; a scale is given as {expected}, above 0"
-                    )
-                scales.append((name, float(scale)))
+        scales = []
         if given["maps"] is not None:
+            scaled = [row.name for row in MAPS.values() if row.scale is not None]
+            names = []
+            for item in given["maps"].split(","):
+                name, colon, scale = (part.strip() for part in item.partition(":"))
+                names.append(name)
+                if colon and (name not in scaled or not 0 < (to_number(scale) or 0) < math.inf):
+                    expected = " or ".join(f"{name}:NUMBER" for name in scaled)
+                    problem = f"--maps has {item.strip()!r}; a scale is given as {expected}"
+                    raise UsageError(f"{problem}, above 0")
+                scales += [(name, float(scale))] if colon else []
             given["maps"] = ",".join(names)
         if given["n_lights"] is None:
             given["seed"] = None
@@ -669,18 +552,12 @@ class InferOptions(Reading, frozen=True, kw_only=True):
 
     def changes(self, earlier: InferOptions) -> list[str]:
         """Return the options that affect the results, which excludes --output and --device."""
-        kinds = records.field_types(type(self))
-        names = [name for name in kinds if getattr(self, name) != getattr(earlier, name)]
-        options = {
-            name: records.option_of(kinds[name])
-            for name in names
-            if name not in ("output", "device")
-        }
-        return list(
-            dict.fromkeys(
-                records.long_name(name, of) if of else "--maps" for name, of in options.items()
-            )
-        )
+        found = {}
+        for name, kind in records.field_types(type(self)).items():
+            if name not in ("output", "device") and getattr(self, name) != getattr(earlier, name):
+                given = records.option_of(kind)
+                found[records.long_name(name, given) if given else "--maps"] = True
+        return list(found)
 
     @property
     def recipe(self) -> RecipeOptions:
@@ -697,8 +574,9 @@ class InferOptions(Reading, frozen=True, kw_only=True):
         return MethodOptions(self.weights, device=self.device, precision=self.precision)
 
     def check_files(self) -> None:
-        """See Reading. Also raise UsageError if a package required by the options is not
-        installed.
+        """See ReadingOptions.
+
+        Also raise UsageError if a package required by the options is not installed.
         """
         super().check_files()
         check_exr(self.formats)
@@ -707,20 +585,8 @@ class InferOptions(Reading, frozen=True, kw_only=True):
 def check_pixel_size(pixel_size: float) -> None:
     """Raise UsageError if a pixel size (mm) is out of range for a surface."""
     if not SMALLEST_PIXEL_MM <= pixel_size <= LARGEST_PIXEL_MM:
-        raise UsageError(
-            f"the pixel size is {pixel_size:g} mm, expected {SMALLEST_PIXEL_MM:g} to"
-            f" {LARGEST_PIXEL_MM:g}"
-        )
-
-
-def parse_indices(text: str, option: str) -> tuple[int, ...]:
-    """Return the integers in a text such as "0,5,12". Raises UsageError."""
-    try:
-        return tuple(int(item) for item in text.split(","))
-    except ValueError:
-        raise UsageError(
-            f"{option} is {text!r}; expected zero-based numbers such as 0,5,12"
-        ) from None
+        expected = f"{SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g}"
+        raise UsageError(f"the pixel size is {pixel_size:g} mm, expected {expected}")
 
 
 class Shard(NamedTuple):
@@ -739,62 +605,41 @@ class Shard(NamedTuple):
             )
         number, count = int(found[1]), int(found[2])
         if not 1 <= number <= count:
-            problem = f"--shard is {number}/{count}; expected I/N with I from 1 to N"
-            raise UsageError(problem, hint="If your job numbers count from 0, add 1")
+            raise UsageError(
+                f"--shard is {number}/{count}; expected I/N with I from 1 to N",
+                hint="If your job numbers count from 0, add 1",
+            )
         return cls(number, count)
 
 
 class BatchOptions(Record, frozen=True, kw_only=True):
-    """The captures of `infer`, whether existing results are computed again,
-    and the printed output.
-    """
+    """The captures of `infer`, what is computed again, and the printed output."""
 
-    captures: Annotated[
-        tuple[Path, ...],
-        Option(
-            "Arguments",
-            "CAPTURE",
-            "Folders with the images of one object each, or films.",
-            repeated=True,
-        ),
-    ]
-    shard: Annotated[
-        Shard | None,
-        Option(
-            "Processes and machines",
-            "I/N",
-            "Process shard I of N: captures I, I+N, I+2N, ...",
-            parse=Shard.parse,
-        ),
-    ] = None
+    captures: tuple[Path, ...] = option(
+        "Arguments",
+        "Folders with the images of one object each, or films.",
+        "CAPTURE",
+        value=NODEFAULT,
+    )
+    shard: Shard | None = option(
+        "Processes and machines",
+        "Process shard I of N: captures I, I+N, I+2N, ...",
+        "I/N",
+        parse=Shard.parse,
+    )
     update: Update = False
     overwrite: Overwrite = False
-    as_json: Annotated[
-        bool,
-        Option(
-            "Output",
-            "",
-            "Print a JSON list of the reports on stdout, and nothing else.",
-            names=("--json",),
-        ),
-    ] = False
-    as_json_lines: Annotated[
-        bool,
-        Option(
-            "Output",
-            "",
-            "Print each report as one line of JSON on stdout as soon as its capture is done.",
-            names=("--jsonl",),
-        ),
-    ] = False
+    as_json: bool = flag(
+        "Output", "Print a JSON list of the reports on stdout, and nothing else.", names="--json"
+    )
+    as_json_lines: bool = flag(
+        "Output",
+        "Print each report as one line of JSON on stdout as soon as its capture is done.",
+        names="--jsonl",
+    )
     quiet: Quiet = False
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.as_json and self.as_json_lines:
-            raise UsageError("--json and --jsonl contradict each other", hint="Leave one out")
-        if self.overwrite and self.update:
-            raise UsageError("--overwrite and --update contradict each other", hint="Leave one out")
+    CONFLICTS = (("as_json", "as_json_lines", LEAVE_ONE), ("overwrite", "update", LEAVE_ONE))
 
     @property
     def redo(self) -> Redo:
@@ -805,65 +650,43 @@ class BatchOptions(Record, frozen=True, kw_only=True):
 class WatchOptions(Record, frozen=True, kw_only=True):
     """The options of `watch`; see its help."""
 
-    folder: Annotated[
-        Path,
-        Option(
-            "Arguments", "FOLDER", "Folder in which captures arrive, each as a subfolder or a film."
-        ),
-    ]
-    options: Annotated[
-        tuple[str, ...],
-        Option("Arguments", "-- OPTIONS", "Options of infer, after two dashes.", repeated=True),
-    ] = ()
-    marker: Annotated[
-        str | None,
-        Option(
-            "Captures",
-            "NAME",
-            "File that appears in a subfolder when it is complete.",
-            default="see --settle",
-        ),
-    ] = None
-    settle: Annotated[
-        NotNegative,
-        Option(
-            "Captures",
-            "SECONDS",
-            "A film, or a subfolder without --marker, is complete when it has not changed for this"
-            " long.",
-        ),
-    ] = 5.0
+    folder: Path = option(
+        "Arguments",
+        "Folder in which captures arrive, each as a subfolder or a film.",
+        "FOLDER",
+        value=NODEFAULT,
+    )
+    options: tuple[str, ...] = option(
+        "Arguments", "Options of infer, after two dashes.", "-- OPTIONS", value=()
+    )
+    marker: str | None = option(
+        "Captures", "File that appears in a subfolder when it is complete.", "NAME", "see --settle"
+    )
+    settle: NotNegative = option(
+        "Captures",
+        "A film, or a subfolder without --marker, is complete when it has not changed for this"
+        " long.",
+        "SECONDS",
+        value=5.0,
+    )
 
 
 class InfoOptions(Display, frozen=True, kw_only=True):
-    """The options of `info` in addition to Reading; see its help."""
+    """The options of `info` in addition to ReadingOptions; see its help."""
 
-    capture: Annotated[
-        Path, Option("Arguments", "CAPTURE", "Folder with the images of one object, or a film.")
-    ]
-    auto_mask: Annotated[
-        bool, Option("Input", "", "If there is no mask, find the object in the images.")
-    ] = False
-    check_lights: Annotated[
-        bool,
-        Option(
-            "Lights",
-            "",
-            "List other readings of the light file, and how well each of them fits the images.",
-        ),
-    ] = False
-    mended_lights: Annotated[
-        Path | None,
-        Option(
-            "Lights",
-            "FILE",
-            "If the light directions fit the images better in another order or frame, write them"
-            " in it.",
-        ),
-    ] = None
-    plot: Annotated[
-        Path | None, Option("Output", "FILE", "Also plot the light directions to a PNG file.")
-    ] = None
-    overwrite: Annotated[
-        bool, Option("Output", "", "Replace an earlier plot or file of lights.")
-    ] = False
+    capture: Path = option(
+        "Arguments", "Folder with the images of one object, or a film.", "CAPTURE", value=NODEFAULT
+    )
+    auto_mask: bool = flag("Input", "If there is no mask, find the object in the images.")
+    check_lights: bool = flag(
+        "Lights",
+        "List other readings of the light file, and how well each of them fits the images.",
+    )
+    mended_lights: Path | None = option(
+        "Lights",
+        "If the light directions fit the images better in another order or frame, write them"
+        " in it.",
+        "FILE",
+    )
+    plot: Path | None = option("Output", "Also plot the light directions to a PNG file.", "FILE")
+    overwrite: bool = flag("Output", "Replace an earlier plot or file of lights.")

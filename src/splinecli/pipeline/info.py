@@ -9,7 +9,7 @@ import numpy as np
 
 from splinecli.capture import CaptureSource
 from splinecli.capture.channel_lights import CHANNELS
-from splinecli.capture.light_files import check_writable, encode_lights
+from splinecli.capture.light_files import encode_lights, light_encoder
 from splinecli.errors import UsageError
 from splinecli.judge.light_check import candidate_rows
 from splinecli.lights.calibration.balls import find_view
@@ -17,7 +17,7 @@ from splinecli.pictures.plots import sky_plot
 from splinecli.pipeline.expected_seconds import expected_seconds
 from splinecli.pipeline.incoming import unpacked
 from splinecli.pipeline.infer import BASE_BYTES, infer_bytes
-from splinecli.pipeline.infer_options import InfoOptions, Reading
+from splinecli.pipeline.infer_options import InfoOptions, ReadingOptions
 from splinecli.recipe.steps import begin, follow, images_to_read
 from splinecli.recipe.work import Work
 from splinecli.system.files import check_free, write_bytes
@@ -33,7 +33,7 @@ ORIGINS = {
 
 
 def describe_capture(
-    options: InfoOptions, reading: Reading | None = None, observer: Observer = SILENT
+    options: InfoOptions, reading: ReadingOptions | None = None, observer: Observer = SILENT
 ) -> dict[str, Any]:
     """Read a capture without estimating normals, write the plot and the corrected lights, and
     return the report.
@@ -42,7 +42,7 @@ def describe_capture(
     warnings. Raises InputError, OutputError, or UsageError if the plot would be in the folder of
     the images, or options contradict.
     """
-    reading, plot, mended_lights = reading or Reading(), options.plot, options.mended_lights
+    reading, plot, mended_lights = reading or ReadingOptions(), options.plot, options.mended_lights
     for name, given in (
         ("--check-lights", options.check_lights),
         ("--mended-lights", mended_lights is not None),
@@ -192,7 +192,7 @@ def _check_outputs(options: InfoOptions, source: CaptureSource) -> None:
             raise UsageError(problem, hint="Choose another folder for it")
         check_free(plot.parent, [plot.name], overwrite=options.overwrite)
     if mended_lights is not None:
-        check_writable(mended_lights)
+        light_encoder(mended_lights)
         if source.lamps is not None and source.lamps.used:
             raise UsageError("--mended-lights writes directions, but the lights are near lamps")
         check_free(mended_lights.parent, [mended_lights.name], overwrite=options.overwrite)
@@ -209,9 +209,8 @@ def _report(work: Work) -> dict[str, Any]:
     intensities, view = files.light_intensities, find_view(source.facts[0], None)
     stages = expected_seconds(
         capture.n_pixels,
-        len(images),
-        height * width,
-        n_reads=images_to_read(work),
+        len(images) * height * width,
+        read_pixels=images_to_read(work) * height * width,
         align=work.options.align,
     )
     seconds = 3 + sum(stages.values())  # 3 to load the libraries and the network

@@ -10,7 +10,6 @@ from typing import Any, get_args
 
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from splinecli.capture import read_image, read_normal_map
 from splinecli.capture.formats.images import ExpectedSize, check_memory
@@ -18,6 +17,7 @@ from splinecli.capture.formats.normal_files import read_depth
 from splinecli.capture.linearise import parse_window
 from splinecli.capture.near_lamps import read_camera_matrix
 from splinecli.errors import InputError, SplinecliError
+from splinecli.maths import Float64Array, Floats, Picture
 from splinecli.maths.normals import Convention, encode_picture
 from splinecli.maths.pixel_grid import ray_basis
 from splinecli.pictures.maps import encode_png
@@ -36,10 +36,11 @@ from splinecli.records.output_files import (
     SURFACE_REPORT,
     file_names,
 )
-from splinecli.results.files import UnfinishedError, read_report
+from splinecli.results.files import UNUSABLE, UnfinishedError, read_report
 from splinecli.surface import surface_files
 from splinecli.surface.bilateral_equations import DISCONTINUITY
-from splinecli.surface.make import make_surface
+from splinecli.surface.make import SurfaceSettings, make_surface
+from splinecli.surface.mesh import Textures
 from splinecli.surface.surface_files import encode_surface
 from splinecli.system.files import check_free, read_json
 from splinecli.system.machine import import_extra
@@ -49,11 +50,10 @@ from splinecli.system.publishing import held_folder, new_files
 
 def view_of_report(
     report: Mapping[str, Any],
-    camera_matrix: NDArray[np.floating] | None = None,
+    camera_matrix: Floats | None = None,
     pixel_size_mm: float | None = None,
-) -> tuple[NDArray[np.float64] | None, float | None]:
-    """Return the camera matrix and the pixel size in millimetres of the normal map described by a
-    report of `infer`.
+) -> tuple[Float64Array | None, float | None]:
+    """Return the camera matrix and the pixel size in millimetres from a report of `infer`.
 
     `camera_matrix` and `pixel_size_mm` refer to the photographs and override the values in the
     report. Raises KeyError, TypeError, ValueError or UsageError if the document is not a report
@@ -77,8 +77,9 @@ def view_of_report(
 
 
 def integrate_normal_map(options: IntegrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
-    """Integrate a normal map, write the surface and its report, and return the report. Raises
-    SplinecliError.
+    """Integrate a normal map, write the surface and its report, and return the report.
+
+    Raises SplinecliError.
     """
     if options.decimate is not None:
         import_extra("fast_simplification", "mesh")
@@ -92,9 +93,10 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
     started = time.perf_counter()
     path = _find_normal_map(options.normals) if options.normals.is_dir() else options.normals
     made_by = _report_of(path)
-    convention = options.convention or (
-        "opengl" if made_by is None else made_by["options"]["convention"]
-    )
+    used: Mapping[str, Any] = {"convention": "opengl", "discontinuity": DISCONTINUITY}
+    if made_by is not None:
+        used = made_by["options"]
+    convention = options.convention or used["convention"]
     normal_map = read_normal_map(path, options.mask, convention=convention)
     mask = np.asarray(normal_map.any(axis=2))
     n_pixels = int(np.count_nonzero(mask))
@@ -104,51 +106,27 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         options.normals,
         hint="Mask the object with --mask, or reduce the normal map (infer --scale)",
     )
-    discontinuity = options.discontinuity
-    if discontinuity is None:
-        discontinuity = (
-            DISCONTINUITY if made_by is None else float(made_by["options"]["discontinuity"])
-        )
-    camera_matrix = (
-        None if options.camera_matrix is None else read_camera_matrix(options.camera_matrix)
-    )
+    discontinuity, camera_matrix, prior = options.discontinuity, None, None
+    if options.camera_matrix is not None:
+        camera_matrix = read_camera_matrix(options.camera_matrix)
     pixel_size = options.pixel_size
     if made_by is not None:
         camera_matrix, pixel_size = view_of_report(made_by, camera_matrix, pixel_size)
-    prior = None
     if options.prior is not None:
         prior = read_depth(options.prior, ExpectedSize(mask.shape, "the normal map", "a depth map"))
-    names = ("base_colour.png", GLOSS, "specular.npy")
-    of_material = [options.normals / MAPS["material"].files[name] for name in names]
-    has_material = all(path.is_file() for path in of_material)
-    picture, gloss, specular = options.colours, None, None
-    of_folder = of_material[0] if has_material else options.normals / MAPS["albedo"].files["png"]
-    if picture is None and of_folder.is_file():
-        picture = of_folder
-        if has_material:
-            gloss = _read_picture(of_material[1], mask.shape)
-            stored = read_depth(of_material[2], ExpectedSize(mask.shape, "the normal map", "a map"))
-            # up to full reflection
-            specular = np.nan_to_num(stored).clip(0, 12.5).astype(np.float32)
-    colours = None if picture is None else _read_picture(picture, mask.shape)
+    settings = SurfaceSettings(
+        float(used["discontinuity"]) if discontinuity is None else discontinuity,
+        pixel_size,
+        options.largest_step,
+        options.decimate,
+        prior,
+        options.prior_detail,
+        options.level,
+        options.pixel_aspect,
+    )
+    picture, textures = _read_textures(options, mask.shape)
     with observer.progress("integrating", 1.0) as advance:
-        surface, found = make_surface(
-            normal_map,
-            mask,
-            camera_matrix,
-            colours,
-            gloss,
-            specular,
-            discontinuity=discontinuity,
-            largest_step=options.largest_step,
-            n_triangles=options.decimate,
-            pixel_size_mm=pixel_size,
-            prior=prior,
-            prior_detail=options.prior_detail,
-            level=options.level,
-            pixel_aspect=options.pixel_aspect,
-            progress=advance,
-        )
+        surface, found = make_surface(normal_map, mask, camera_matrix, textures, settings, advance)
     report = {
         "schema": 3,
         "normals": str(options.normals),
@@ -160,9 +138,8 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         "image_size": [mask.shape[1], mask.shape[0]],
         **found,
     }
-    with new_files(
-        options.folder, report=SURFACE_REPORT, stale=_earlier_files(options.folder)
-    ) as new:
+    stale = _earlier_files(options.folder)
+    with new_files(options.folder, report=SURFACE_REPORT, stale=stale) as new:
         for name, content in encode_surface(surface, options.formats):
             new.write(name, content)
         if surface.level_normals is not None:
@@ -170,18 +147,44 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
             new.write(LEVEL_PICTURE, encode_png(encode_picture(surface.level_normals, mask)))
         report["seconds"] = round(time.perf_counter() - started, 3)
         report["folder"] = str(options.folder.absolute())
-        report["files"] = [
-            name for name in options.files if name in new.sizes or name == SURFACE_REPORT
-        ]
+        report["files"] = [name for name in options.files if name in {*new.sizes, SURFACE_REPORT}]
         new.write(SURFACE_REPORT, json.dumps(report, indent=2) + "\n")
     if report["level"] is not None:
         observer.say(f"The surface was levelled by {report['level']['tilt_deg']:.2f} degrees")
     return report
 
 
-def _read_picture(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """Return an image as a picture (H, W, 3) of 8 bits. Raises InputError if its size is not (H,
-    W).
+def _read_textures(
+    options: IntegrateOptions, shape: tuple[int, ...]
+) -> tuple[Path | None, Textures]:
+    """Return the image of the colours, if any, and the textures (H, W).
+
+    They come from the options, or from the maps in the folder.
+    """
+    folder, picture = options.normals, options.colours
+    material = MAPS["material"].files
+    base, gloss, specular = (
+        folder / material[name] for name in ("base_colour.png", GLOSS, "specular.npy")
+    )
+    has_material = all(path.is_file() for path in (base, gloss, specular))
+    of_folder = base if has_material else folder / MAPS["albedo"].files["png"]
+    if picture is None and of_folder.is_file():
+        picture = of_folder
+    if picture is None:
+        return None, Textures()
+    colours = _read_picture(picture, shape)
+    if options.colours is not None or not has_material:
+        return picture, Textures(colours)
+    stored = np.nan_to_num(read_depth(specular, ExpectedSize(shape, "the normal map", "a map")))
+    # up to full reflection
+    reflection = stored.clip(0, 12.5).astype(np.float32)
+    return picture, Textures(colours, _read_picture(gloss, shape), reflection)
+
+
+def _read_picture(path: Path, shape: tuple[int, ...]) -> Picture:
+    """Return an image as a picture (H, W, 3) of 8 bits.
+
+    Raises InputError if its size is not (H, W).
     """
     image = np.broadcast_to(read_image(path, ExpectedSize(shape, "the normal map")), (*shape, 3))
     return np.asarray(np.rint(255 * image.clip(0, 1)), np.uint8)
@@ -189,14 +192,11 @@ def _read_picture(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
 
 def summary_line(options: IntegrateOptions, report: dict[str, Any]) -> str:
     """Return a one-line summary of the files that were written."""
-    unit = {"pixel": "pixels", "mean depth": "times the mean depth", "millimetre": "mm"}[
-        report["unit"]
-    ]
+    units = {"pixel": "pixels", "mean depth": "times the mean depth", "millimetre": "mm"}
     low, high = report["range"]
-    return (
-        f"{options.folder}: {report['n_pixels']} pixels, from {low:.4g} to {high:.4g} {unit},"
-        f" {report['seconds']:.1f} s"
-    )
+    extent = f"from {low:.4g} to {high:.4g} {units[report['unit']]}"
+    pixels, seconds = report["n_pixels"], report["seconds"]
+    return f"{options.folder}: {pixels} pixels, {extent}, {seconds:.1f} s"
 
 
 class _Listing(Struct):
@@ -206,16 +206,15 @@ class _Listing(Struct):
 
 
 def _earlier_files(folder: Path) -> list[str]:
-    """Return the surface files that an earlier `integrate` wrote to the folder; files from `infer`
-    are kept.
+    """Return the surface files that an earlier `integrate` wrote to the folder.
+
+    Files from `infer` are kept.
     """
     try:
         named = read_json(folder / SURFACE_REPORT, _Listing).files
-        return [
-            name for name in (*file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS) if name in named
-        ]
     except (OSError, ValueError):
         return []
+    return [name for name in (*file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS) if name in named]
 
 
 def _find_normal_map(folder: Path) -> Path:
@@ -227,7 +226,7 @@ def _find_normal_map(folder: Path) -> Path:
         problem = f"the folder has no normal map ({', '.join(names)})"
     except UnfinishedError as error:
         problem = f"the folder has no whole results of infer: it {error}"
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except UNUSABLE:
         problem = f"the folder has no whole results of infer: its {REPORT} is damaged"
     raise InputError(
         problem, path=folder, hint="Give a folder that 'splinecli infer' wrote, or one of its files"
@@ -235,27 +234,24 @@ def _find_normal_map(folder: Path) -> Path:
 
 
 def _report_of(path: Path) -> dict[str, Any] | None:
-    """Return the report of the `infer` run that wrote a normal map, or None if it has another
-    origin.
-    """
+    """Return the report of the run that wrote a normal map, or None without one."""
     try:
         report: dict[str, Any] = read_json(path.parent / REPORT)
         if path.name not in report["files"]:
             return None
-    except (OSError, ValueError, KeyError, TypeError):
+    except UNUSABLE:
         return None
-    with suppress(ValueError, KeyError, TypeError, AttributeError, OverflowError, SplinecliError):
+    with suppress(*UNUSABLE, OverflowError, SplinecliError):
         camera_matrix, _ = view_of_report(report)
         if camera_matrix is not None:
             ray_basis(camera_matrix)
-        convention, discontinuity = (
-            report["options"]["convention"],
-            float(report["options"]["discontinuity"]),
-        )
-        if convention in get_args(Convention) and 0 <= discontinuity < math.inf:
+        used = report["options"]
+        is_finite = 0 <= float(used["discontinuity"]) < math.inf
+        if is_finite and used["convention"] in get_args(Convention):
             return report
-    problem = (
-        "is damaged, or from another version: it does not say how the normal map beside it was made"
+    problem = "is damaged, or from another version: it does not say how the normal map beside it"
+    raise InputError(
+        f"{problem} was made",
+        path=path.parent / REPORT,
+        hint="Run 'splinecli infer' again, or move the normal map to another folder",
     )
-    hint = "Run 'splinecli infer' again, or move the normal map to another folder"
-    raise InputError(problem, path=path.parent / REPORT, hint=hint)

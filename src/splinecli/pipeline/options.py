@@ -1,16 +1,17 @@
-"""The options of the commands that are not for individual captures, as frozen records. See their
-help.
+"""The options of the commands that are not for individual captures, as frozen records.
+
+See their help.
 """
 
-# The options form a table: name, type, panel and kind of value, then the help text.
+# The options form a table: name and type, then panel, help text and kind of value.
 from __future__ import annotations
 
 from contextlib import suppress
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Annotated
 
-from msgspec import Meta
+from msgspec import NODEFAULT, Meta
 
 from splinecli.capture.record import ESTIMATE
 from splinecli.errors import UsageError
@@ -27,13 +28,14 @@ from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.pipeline import infer_options as shared
 from splinecli.pipeline.infer_options import (
     HERE,
+    LEAVE_ONE,
     MASK_IMAGE,
     OUTPUT,
     ClusterOptions,
     Display,
     parse_indices,
 )
-from splinecli.records.base import Count, FileName, NotNegative, Option, Positive, listed
+from splinecli.records.base import Count, FileName, NotNegative, Positive, flag, listed, option
 from splinecli.records.output_files import LEVEL_NORMALS, SURFACE_FILES, SURFACE_REPORT, file_names
 from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.surface_files import DEFAULT_FORMATS
@@ -55,273 +57,206 @@ def parse_circle(text: str) -> tuple[float, float, float]:
 class CalibrateOptions(Display, frozen=True, kw_only=True):
     """The options of `calibrate`."""
 
-    balls: Annotated[
-        tuple[Path, ...],
-        Option("Arguments", "BALL", "Folders of images of one mirror ball each.", repeated=True),
-    ]
-    circles: Annotated[
-        tuple[tuple[float, float, float], ...],
-        Option(
-            "Input",
-            "X,Y,R",
-            "Outline of the ball in pixels, y down. May be repeated, once for each BALL.",
-            names=("--circle",),
-            parse=parse_circle,
-            repeated=True,
-        ),
-    ] = ()
-    masks: Annotated[
-        tuple[Path, ...],
-        Option(
-            "Input",
-            "FILE",
-            f"{MASK_IMAGE.format('ball')} May be repeated, once for each BALL.",
-            names=("--mask",),
-            repeated=True,
-        ),
-    ] = ()
-    ball_diameter: Annotated[
-        Positive | None,
-        Option(
-            "Input",
-            "D",
-            "Diameter of each ball in any unit, such as millimetres. The lamps' positions have the"
-            " same unit.",
-            default="pixels",
-        ),
-    ] = None
-    camera_matrix: Annotated[
-        Path | None,
-        Option(
-            "Input",
-            "FILE",
-            "Text file of the 3 x 3 camera matrix in pixels.",
-            default="focal length from EXIF, or a distant camera",
-        ),
-    ] = None
-    gray_ball: Annotated[
-        Path | None,
-        Option("Light intensities", "DIR", "Images of a matte gray ball under the same lights."),
-    ] = None
-    gray_card: Annotated[
-        Path | None,
-        Option("Light intensities", "DIR", "Images of a matte gray card that faces the camera."),
-    ] = None
-    lights_in_channels: Annotated[
-        bool,
-        Option(
-            "Light intensities",
-            "",
-            "The images of the gray ball are colour images under three coloured lamps at once:"
-            " measure the crosstalk."
-            " BALL then contains one image under each lamp alone, in the order R, G, B.",
-        ),
-    ] = False
-    transfer: Annotated[
-        str,
-        Option(
-            "Light intensities",
-            "CURVE",
-            "Transfer curve of the gray target's images: auto, linear, srgb or gamma:G.",
-            complete=shared.CURVES,
-        ),
-    ] = AUTOMATIC
-    compare: Annotated[
-        Path | None,
-        Option("Output", "FILE", "Compare the result with the light directions in a text file."),
-    ] = None
-    output: Annotated[Path, Option("Output", "OUT", "Folder of the results.", names=OUTPUT)] = Path(
-        "calibration"
+    balls: tuple[Path, ...] = option(
+        "Arguments", "Folders of images of one mirror ball each.", "BALL", value=NODEFAULT
+    )
+    circles: tuple[tuple[float, float, float], ...] = option(
+        "Input",
+        "Outline of the ball in pixels, y down. May be repeated, once for each BALL.",
+        "X,Y,R",
+        value=(),
+        names="--circle",
+        parse=parse_circle,
+    )
+    masks: tuple[Path, ...] = option(
+        "Input",
+        f"{MASK_IMAGE.format('ball')} May be repeated, once for each BALL.",
+        "FILE",
+        value=(),
+        names="--mask",
+    )
+    ball_diameter: Positive | None = option(
+        "Input",
+        "Diameter of each ball in any unit, such as millimetres. The lamps' positions have the"
+        " same unit.",
+        "D",
+        "pixels",
+    )
+    camera_matrix: Path | None = option(
+        "Input",
+        "Text file of the 3 x 3 camera matrix in pixels.",
+        "FILE",
+        "focal length from EXIF, or a distant camera",
+    )
+    gray_ball: Path | None = option(
+        "Light intensities", "Images of a matte gray ball under the same lights.", "DIR"
+    )
+    gray_card: Path | None = option(
+        "Light intensities", "Images of a matte gray card that faces the camera.", "DIR"
+    )
+    lights_in_channels: bool = flag(
+        "Light intensities",
+        "The images of the gray ball are colour images under three coloured lamps at once:"
+        " measure the crosstalk. BALL then contains one image under each lamp alone, in the"
+        " order R, G, B.",
+    )
+    transfer: str = option(
+        "Light intensities",
+        "Transfer curve of the gray target's images: auto, linear, srgb or gamma:G.",
+        "CURVE",
+        value=AUTOMATIC,
+        complete=shared.CURVES,
+    )
+    compare: Path | None = option(
+        "Output", "Compare the result with the light directions in a text file.", "FILE"
+    )
+    output: Path = option(
+        "Output", "Folder of the results.", "OUT", value=Path("calibration"), names=OUTPUT
     )
     overwrite: shared.Overwrite = False
+
+    CONFLICTS = (("gray_ball", "gray_card", LEAVE_ONE),)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if parse_transfer(self.transfer) != 1 and not (self.gray_ball or self.gray_card):
-            hint = "Leave it out: the light directions do not depend on the curve"
-            raise UsageError("--transfer needs --gray-ball or --gray-card", hint=hint)
-        if self.ball_diameter is not None and len(self.balls) < 2:
-            hint = (
-                "Photograph a second ball, or the same ball at another place: one ball gives no"
-                " positions"
+            raise UsageError(
+                "--transfer needs --gray-ball or --gray-card",
+                hint="Leave it out: the light directions do not depend on the curve",
             )
-            raise UsageError("--ball-diameter needs two balls or more", hint=hint)
+        if self.ball_diameter is not None and len(self.balls) < 2:
+            hint = "Photograph a second ball, or the same ball at another place: one ball gives no"
+            raise UsageError("--ball-diameter needs two balls or more", hint=f"{hint} positions")
         if self.lights_in_channels and not self.gray_ball:
             raise UsageError(
                 "--lights-in-channels needs --gray-ball",
                 hint="Photograph a matte gray or white ball",
             )
-        if self.gray_ball and self.gray_card:
-            raise UsageError(
-                "--gray-ball and --gray-card contradict each other", hint="Leave one out"
-            )
-        for option, values in (("--circle", self.circles), ("--mask", self.masks)):
+
+        for name, values in (("--circle", self.circles), ("--mask", self.masks)):
             if values and len(values) != len(self.balls):
                 times = "once" if len(values) == 1 else f"{len(values)} times"
-                problem = f"{option} is given {times} for {len(self.balls)} balls"
-                raise UsageError(problem, hint="Give it once for each ball, in the same order")
+                raise UsageError(
+                    f"{name} is given {times} for {len(self.balls)} balls",
+                    hint="Give it once for each ball, in the same order",
+                )
 
 
 def parse_level(text: str) -> tuple[tuple[int, int], ...]:
-    """Return the points in a text such as "10,20 90,20 50,80", or () for "plane". Raises
-    UsageError.
+    """Return the points in a text such as "10,20 90,20 50,80", or () for "plane".
+
+    Raises UsageError.
     """
     if text.strip() == "plane":
         return ()
-    try:
+    with suppress(ValueError):
         points = tuple((int(x), int(y)) for x, y in (point.split(",") for point in text.split()))
         if len(points) >= 3:
             return points
-    except ValueError:
-        pass
-    hint = "Put quotation marks around the points"
     raise UsageError(
-        f'--level is {text!r}; expected plane, or at least three points "X,Y X,Y X,Y"', hint=hint
+        f'--level is {text!r}; expected plane, or at least three points "X,Y X,Y X,Y"',
+        hint="Put quotation marks around the points",
     )
 
 
 class IntegrateOptions(Display, frozen=True, kw_only=True):
     """The options of `integrate`."""
 
-    normals: Annotated[
-        Path,
-        Option(
-            "Arguments",
-            "NORMALS",
-            "Normal map (.npy, .png, .tif, .mat), or a folder that infer wrote.",
-        ),
-    ]
-    mask: Annotated[
-        Path | None,
-        Option(
-            "Input", "FILE", MASK_IMAGE.format("object"), default="all pixels that have a normal"
-        ),
-    ] = None
-    camera_matrix: Annotated[
-        Path | None,
-        Option(
-            "Input",
-            "FILE",
-            "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera.",
-            default="as in report.json beside the normal map, or orthographic",
-        ),
-    ] = None
-    pixel_size: Annotated[
-        Annotated[float, Meta(ge=shared.SMALLEST_PIXEL_MM, le=shared.LARGEST_PIXEL_MM)] | None,
-        Option(
-            "Input",
-            "MM",
-            "Width of a pixel of the photographs on the object in millimetres, for a surface in"
-            " millimetres.",
-            default="as given to infer --surface by report.json beside the normal map, or none",
-        ),
-    ] = None
-    pixel_aspect: Annotated[
-        Annotated[float, Meta(ge=0.01, le=100)],
-        Option(
-            "Input",
-            "A",
-            "Height of a pixel on the object, in widths of a pixel, for line scanners and scaled"
-            " images.",
-        ),
-    ] = 1.0
-    convention: Annotated[
-        Convention | None,
-        Option(
-            "Input",
-            "",
-            "Green channel of a normal map of colours: opengl is y up, directx is y down.",
-            default="as in report.json beside it, or opengl",
-        ),
-    ] = None
-    colours: Annotated[
-        Path | None,
-        Option(
-            "Input",
-            "FILE",
-            "Image of the object's colours, for the mesh.",
-            default="albedo.png beside NORMALS, if NORMALS is a folder",
-        ),
-    ] = None
-    prior: Annotated[
-        Path | None,
-        Option(
-            "Input",
-            "FILE",
-            "Depth map of the same view from elsewhere, such as a scan: the surface takes its"
-            " overall shape from"
-            " it, and the detail from the normals. .npy, .tif or .exr, with heights towards the"
-            " camera in the unit"
-            " of the result, or with depths in millimetres for a perspective camera. NaN is"
-            " unknown.",
-        ),
-    ] = None
-    discontinuity: Annotated[
-        NotNegative | None,
-        Option(
-            "Method",
-            "K",
-            shared.DISCONTINUITY_HELP,
-            default=f"as in report.json beside the normal map, or {DISCONTINUITY:g}",
-        ),
-    ] = None
-    prior_detail: Annotated[
-        Annotated[float, Meta(ge=1)] | None,
-        Option(
-            "Method",
-            "PIXELS",
-            "With --prior: shapes narrower than this come from the normals.",
-            default="15 % of the object's size",
-        ),
-    ] = None
-    largest_step: Annotated[
-        NotNegative | None,
-        Option(
-            "Method",
-            "PIXELS",
-            "Leave out triangles whose corners differ by more than this height.",
-            default="keep all",
-        ),
-    ] = None
-    level: Annotated[
-        tuple[tuple[int, int], ...] | None,
-        Option(
-            "Method",
-            "plane|POINTS",
-            "Level the surface, and write its normals: plane removes the slope of"
-            " its dominant plane; three or"
-            ' more pixels "X,Y X,Y X,Y" define the plane that becomes level.',
-            parse=parse_level,
-        ),
-    ] = None
-    output: Annotated[
-        Path | None,
-        Option(
-            "Output", "OUT", "Folder of the results.", default="the folder of NORMALS", names=OUTPUT
-        ),
-    ] = None
-    formats: Annotated[
-        tuple[str, ...],
-        Option(
-            "Output",
-            "LIST",
-            f"Files to write, any of {', '.join(SURFACE_FILES)}: meshes, and depth maps in float32"
-            " or as a 16-bit"
-            " picture (png). exr needs the extra 'exr'.",
-            names=("--format",),
-            items=SURFACE_FILES,
-        ),
-    ] = DEFAULT_FORMATS
-    decimate: Annotated[
-        Count | None,
-        Option(
-            "Output",
-            "N",
-            "Reduce the mesh to N triangles; a texture of the normals keeps the detail in GLB"
-            " (needs the extra 'mesh').",
-            default="all",
-        ),
-    ] = None
+    normals: Path = option(
+        "Arguments",
+        "Normal map (.npy, .png, .tif, .mat), or a folder that infer wrote.",
+        "NORMALS",
+        value=NODEFAULT,
+    )
+    mask: Path | None = option(
+        "Input", MASK_IMAGE.format("object"), "FILE", "all pixels that have a normal"
+    )
+    camera_matrix: Path | None = option(
+        "Input",
+        "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera.",
+        "FILE",
+        "as in report.json beside the normal map, or orthographic",
+    )
+    pixel_size: (
+        Annotated[float, Meta(ge=shared.SMALLEST_PIXEL_MM, le=shared.LARGEST_PIXEL_MM)] | None
+    ) = option(
+        "Input",
+        "Width of a pixel of the photographs on the object in millimetres, for a surface in"
+        " millimetres.",
+        "MM",
+        "as given to infer --surface by report.json beside the normal map, or none",
+    )
+    pixel_aspect: Annotated[float, Meta(ge=0.01, le=100)] = option(
+        "Input",
+        "Height of a pixel on the object, in widths of a pixel, for line scanners and scaled"
+        " images.",
+        "A",
+        value=1.0,
+    )
+    convention: Convention | None = option(
+        "Input",
+        "Green channel of a normal map of colours: opengl is y up, directx is y down.",
+        default="as in report.json beside it, or opengl",
+    )
+    colours: Path | None = option(
+        "Input",
+        "Image of the object's colours, for the mesh.",
+        "FILE",
+        "albedo.png beside NORMALS, if NORMALS is a folder",
+    )
+    prior: Path | None = option(
+        "Input",
+        "Depth map of the same view from elsewhere, such as a scan: the surface takes its"
+        " overall shape from it, and the detail from the normals. .npy, .tif or .exr, with"
+        " heights towards the camera in the unit of the result, or with depths in millimetres"
+        " for a perspective camera. NaN is unknown.",
+        "FILE",
+    )
+    discontinuity: NotNegative | None = option(
+        "Method",
+        shared.DISCONTINUITY_HELP,
+        "K",
+        f"as in report.json beside the normal map, or {DISCONTINUITY:g}",
+    )
+    prior_detail: Annotated[float, Meta(ge=1)] | None = option(
+        "Method",
+        "With --prior: shapes narrower than this come from the normals.",
+        "PIXELS",
+        "15 % of the object's size",
+    )
+    largest_step: NotNegative | None = option(
+        "Method",
+        "Leave out triangles whose corners differ by more than this height.",
+        "PIXELS",
+        "keep all",
+    )
+    level: tuple[tuple[int, int], ...] | None = option(
+        "Method",
+        "Level the surface, and write its normals: plane removes the slope of"
+        " its dominant plane; three or"
+        ' more pixels "X,Y X,Y X,Y" define the plane that becomes level.',
+        "plane|POINTS",
+        parse=parse_level,
+    )
+    output: Path | None = option(
+        "Output", "Folder of the results.", "OUT", "the folder of NORMALS", names=OUTPUT
+    )
+    formats: tuple[str, ...] = option(
+        "Output",
+        f"Files to write, any of {', '.join(SURFACE_FILES)}: meshes, and depth maps in float32"
+        " or as a 16-bit picture (png). exr needs the extra 'exr'.",
+        "LIST",
+        value=DEFAULT_FORMATS,
+        names="--format",
+        items=SURFACE_FILES,
+    )
+    decimate: Count | None = option(
+        "Output",
+        "Reduce the mesh to N triangles; a texture of the normals keeps the detail in GLB"
+        " (needs the extra 'mesh').",
+        "N",
+        "all",
+    )
     overwrite: shared.Overwrite = False
 
     def __post_init__(self) -> None:
@@ -376,195 +311,147 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
     Without any number, DEFAULT_LIGHTS is used, or the number in the draws file.
     """
 
-    datasets: Annotated[
-        tuple[Path, ...],
-        Option(
-            "Arguments",
-            "DATASET",
-            "Folders of captures with ground truth, or the captures themselves.",
-            repeated=True,
-        ),
-    ]
-    skip_first: Annotated[
-        tuple[tuple[str, int], ...],
-        Option(
-            "Input",
-            "[CAPTURE=]N",
-            "Leave out the first N images of one capture, or of all. May be repeated.",
-            default="0",
-            parse=parse_skip,
-            repeated=True,
-        ),
-    ] = ()
-    max_pixels: Annotated[
-        Count | None, Option("Input", "N", "Score N random pixels of each capture.", default="all")
-    ] = None
+    datasets: tuple[Path, ...] = option(
+        "Arguments",
+        "Folders of captures with ground truth, or the captures themselves.",
+        "DATASET",
+        value=NODEFAULT,
+    )
+    skip_first: tuple[tuple[str, int], ...] = option(
+        "Input",
+        "Leave out the first N images of one capture, or of all. May be repeated.",
+        "[CAPTURE=]N",
+        "0",
+        value=(),
+        parse=parse_skip,
+    )
+    max_pixels: Count | None = option("Input", "Score N random pixels of each capture.", "N", "all")
     as_stored: shared.AsStored = False
-    white_level: shared.WhiteLevel = None
-    lights: Annotated[
-        str | None,
-        Option(
-            "Lights",
-            "estimate",
-            "Estimate the lights of each draw from its images, and score them, too.",
-            default="the captures' light files",
-        ),
-    ] = None
-    n_lights: Annotated[
-        tuple[int | None, ...],
-        Option(
-            "Lights",
-            "K|all",
-            "Number of lights in each draw. May be repeated.",
-            default=str(DEFAULT_LIGHTS),
-            parse=parse_light_count,
-            repeated=True,
-        ),
-    ] = ()
-    trials: Annotated[
-        Count | None,
-        Option(
-            "Lights",
-            "T",
-            "Number of random draws.",
-            default=f"{DEFAULT_TRIALS}; {TRIALS_OF_MANY} with four methods or more",
-        ),
-    ] = None
+    white_level: shared.GivenWhiteLevel = None
+    lights: str | None = option(
+        "Lights",
+        "Estimate the lights of each draw from its images, and score them, too.",
+        "estimate",
+        "the captures' light files",
+    )
+    n_lights: tuple[int | None, ...] = option(
+        "Lights",
+        "Number of lights in each draw. May be repeated.",
+        "K|all",
+        str(DEFAULT_LIGHTS),
+        value=(),
+        parse=parse_light_count,
+    )
+    trials: Count | None = option(
+        "Lights",
+        "Number of random draws.",
+        "T",
+        f"{DEFAULT_TRIALS}; {TRIALS_OF_MANY} with four methods or more",
+    )
     seed: shared.RandomSeed = 0
-    draws: Annotated[
-        FileName | None,
-        Option("Lights", "FILE", "Draws of lights: each line has light indices, counted from 0."),
-    ] = None
-    light_noise_deg: Annotated[
-        tuple[NotNegative, ...],
-        Option(
-            "Lights",
-            "SIGMA",
-            "Tilt the lights at random, with this standard deviation in degrees. May be repeated.",
-            repeated=True,
-        ),
-    ] = (0.0,)
+    draws: FileName | None = option(
+        "Lights", "Draws of lights: each line has light indices, counted from 0.", "FILE"
+    )
+    light_noise_deg: tuple[NotNegative, ...] = option(
+        "Lights",
+        "Tilt the lights at random, with this standard deviation in degrees. May be repeated.",
+        "SIGMA",
+        value=(0.0,),
+    )
     refine_lights: shared.RefineLights = False
-    light_error_deg: Annotated[
-        float | None,
-        Option(
-            "Lights",
-            "SIGMA",
-            "With --refine-lights: usual error of the directions in degrees.",
-            default="5",
-        ),
-    ] = None
-    methods: Annotated[
-        tuple[str, ...],
-        Option(
-            "Method",
-            "M",
-            f"Method to score: all, {listed(method_names())}. May be repeated.",
-            names=("--method",),
-            complete=(*method_names(), "all"),
-            repeated=True,
-        ),
-    ] = (DEFAULT_METHOD,)
+    light_error_deg: float | None = option(
+        "Lights", "With --refine-lights: usual error of the directions in degrees.", "SIGMA", "5"
+    )
+    methods: tuple[str, ...] = option(
+        "Method",
+        f"Method to score: all, {listed(method_names())}. May be repeated.",
+        "M",
+        value=(DEFAULT_METHOD,),
+        names="--method",
+        complete=(*method_names(), "all"),
+    )
     weights: shared.Weights = None
-    rotations: Annotated[
-        Count | None,
-        Option(
-            "Method",
-            "R",
-            "Average the network's result over R views of each pixel: its lights rotated, for"
-            " spline-net also mirrored.",
-            default="1; cnn-ps: 10",
-        ),
-    ] = None
+    rotations: Count | None = option(
+        "Method",
+        "Average the network's result over R views of each pixel: its lights rotated, for"
+        " spline-net also mirrored.",
+        "R",
+        "1; cnn-ps: 10",
+    )
     device: shared.DeviceName = "auto"
     precision: shared.PrecisionName = "auto"
-    jobs: Annotated[
-        Count | None,
-        Option("Speed", "N", "Number of trials at a time.", default="number of cores; 1 on a GPU"),
-    ] = None
-    cluster: ClusterOptions = HERE
-    figures: Annotated[
-        bool, Option("Output", "", "Draw every method's maps for the first draw of each capture.")
-    ] = False
-    pixels: Annotated[
-        tuple[tuple[int, int], ...],
-        Option(
-            "Output",
-            "ROW,COLUMN",
-            "With --figures: show the observation maps of this pixel. May be repeated.",
-            names=("--pixel",),
-            parse=parse_pixel,
-            repeated=True,
-        ),
-    ] = ()
-    relight: Annotated[
-        bool,
-        Option(
-            "Output",
-            "",
-            "Estimate normals and material from the first draw of each capture, render the capture"
-            " under its other lights,"
-            " and compare with the photographs.",
-        ),
-    ] = False
-    output: Annotated[FileName, Option("Output", "OUT", "Folder of the results.", names=OUTPUT)] = (
-        "evaluation"
+    jobs: Count | None = option(
+        "Speed", "Number of trials at a time.", "N", "number of cores; 1 on a GPU"
     )
-    overwrite: Annotated[
-        bool, Option("Output", "", "Compute all trials again, also those stored in OUT.")
-    ] = False
+    cluster: ClusterOptions = HERE
+    figures: bool = flag("Output", "Draw every method's maps for the first draw of each capture.")
+    pixels: tuple[tuple[int, int], ...] = option(
+        "Output",
+        "With --figures: show the observation maps of this pixel. May be repeated.",
+        "ROW,COLUMN",
+        value=(),
+        names="--pixel",
+        parse=parse_pixel,
+    )
+    relight: bool = flag(
+        "Output",
+        "Estimate normals and material from the first draw of each capture, render the capture"
+        " under its other lights, and compare with the photographs.",
+    )
+    output: FileName = option(
+        "Output", "Folder of the results.", "OUT", value="evaluation", names=OUTPUT
+    )
+    overwrite: bool = flag("Output", "Compute all trials again, also those stored in OUT.")
+
+    CONFLICTS = (
+        ("draws", "n_lights", "Leave --n-lights out: the draws determine the number of lights"),
+        ("draws", "trials", "Leave --trials out: each line of the draws is a trial"),
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.draws is not None and self.n_lights:
-            hint = "Leave --n-lights out: the draws determine the number of lights"
-            raise UsageError("--draws and --n-lights contradict each other", hint=hint)
-        if self.draws is not None and self.trials is not None:
-            hint = "Leave --trials out: each line of the draws is a trial"
-            raise UsageError("--draws and --trials contradict each other", hint=hint)
         from splinecli.lights.light_fit import check_light_error
 
         check_light_error(self.light_error_deg, refines=self.refine_lights)
         if self.lights not in (None, ESTIMATE):
-            hint = "Without it, the light files of the captures are used"
-            raise UsageError(f"--lights is {self.lights}; expected {ESTIMATE}", hint=hint)
-        if self.lights is not None and (self.refine_lights or any(self.light_noise_deg)):
-            problem = (
-                "--lights estimate uses no light file, so it contradicts --refine-lights and"
-                " --light-noise-deg"
+            raise UsageError(
+                f"--lights is {self.lights}; expected {ESTIMATE}",
+                hint="Without it, the light files of the captures are used",
             )
-            raise UsageError(problem, hint="Leave these out")
+        if self.lights is not None and (self.refine_lights or any(self.light_noise_deg)):
+            problem = "--lights estimate uses no light file, so it contradicts --refine-lights and"
+            raise UsageError(f"{problem} --light-noise-deg", hint="Leave these out")
         if self.cluster != HERE and self.jobs is not None:
-            hint = "Leave it out: a worker scores one trial at a time"
-            raise UsageError("--jobs contradicts --workers and --cluster", hint=hint)
+            raise UsageError(
+                "--jobs contradicts --workers and --cluster",
+                hint="Leave it out: a worker scores one trial at a time",
+            )
         for name in self.names:
             check_method(name)
-        if self.pixels and not (
-            self.figures and any(METHODS[name].observation_maps for name in self.names)
-        ):
-            problem = "--pixel chooses the observation maps that --figures shows"
-            raise UsageError(problem, hint="Add --figures and --method spline-net")
+        with_maps = self.figures and any(METHODS[name].observation_maps for name in self.names)
+        if self.pixels and not with_maps:
+            raise UsageError(
+                "--pixel chooses the observation maps that --figures shows",
+                hint="Add --figures and --method spline-net",
+            )
         _ = self.protocols
 
     @property
     def names(self) -> list[str]:
         """The names of the methods, without duplicates."""
-        return list(
-            dict.fromkeys(
-                n for name in self.methods for n in (method_names() if name == "all" else [name])
-            )
-        )
+        chosen = (method_names() if name == "all" else [name] for name in self.methods)
+        return list(dict.fromkeys(chain.from_iterable(chosen)))
 
     @property
     def method_options(self) -> MethodOptions:
         """The options for the methods."""
-        return MethodOptions(
-            self.weights, self.rotations, device=self.device, precision=self.precision
-        )
+        device, precision = self.device, self.precision
+        return MethodOptions(self.weights, self.rotations, device=device, precision=precision)
 
     @property
     def protocols(self) -> list[Protocol]:
         """One protocol for each combination of number of lights and light noise.
+
         Raises UsageError.
         """
         from splinecli.lights.light_fit import LIGHT_ERROR_DEG

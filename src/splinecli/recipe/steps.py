@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from splinecli.capture.linearise import StoredPixels
-from splinecli.capture.reader import open_capture
+from splinecli.capture.reader import CaptureOptions, open_capture
 from splinecli.capture.record import Capture, check_light_indices
 from splinecli.capture.source import Source
 from splinecli.errors import InputError
@@ -25,12 +25,7 @@ from splinecli.images.saturation import find_object, restore_saturated
 from splinecli.judge.checks import check_capture
 from splinecli.lights.light_fit import refine_capture
 from splinecli.maths import Float64Array
-from splinecli.recipe.reading import (
-    Observed,
-    compared_pixels,
-    exposure_warnings,
-    read_observations,
-)
+from splinecli.recipe.reading import Observed, compared_pixels, exposure_warnings, read_observations
 from splinecli.recipe.registration import register
 from splinecli.recipe.work import USUAL, RecipeOptions, Work
 from splinecli.records.capture_warnings import (
@@ -289,9 +284,7 @@ def images_to_read(work: Work) -> int:
 
 
 def begin(
-    source: Source,
-    light_indices: Sequence[int] | None = None,
-    options: RecipeOptions = USUAL,
+    source: Source, light_indices: Sequence[int] | None = None, options: RecipeOptions = USUAL
 ) -> Work:
     """Return the work on the images of these lights (None for all), before the first step.
 
@@ -314,7 +307,7 @@ def prepare_capture(
     Raises the errors of `begin` and of the steps.
 
     Examples:
-        >>> from splinecli.capture import open_capture
+        >>> from splinecli.capture import CaptureOptions, open_capture
         >>> from splinecli.recipe.steps import prepare_capture
         >>> capture = prepare_capture(open_capture("examples/medallion"), [0, 2, 4])
         >>> capture.observations.shape, capture.light_directions.shape
@@ -341,6 +334,9 @@ def read_capture(
         10
     """
     source = open_capture(
-        folder, lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth
+        folder,
+        CaptureOptions(
+            lights=lights, intensities=intensities, mask=mask, ground_truth=ground_truth
+        ),
     )
     return prepare_capture(source, light_indices, RecipeOptions(as_stored=as_stored))

@@ -1,42 +1,43 @@
 """Records: frozen options, settings and documents, declared once and checked when they are made.
 
-A field's annotation gives its type, its range (`msgspec.Meta`) and, for an option of a command, an
-`Option`. The command line, the checks, `as_dict`, `from_dict`, the JSON Schema and the man pages
-follow from it.
+A field's annotation gives its type and its range (`msgspec.Meta`). A field that is an option of a
+command has an `option` instead of a default, or an annotation with an `Option`. The command line,
+the checks, `as_dict`, `from_dict`, the JSON Schema and the man pages follow from them.
 """
 
 from __future__ import annotations
 
+import re
 import types
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, is_dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    Self,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
-from msgspec import Meta, Struct, ValidationError, convert, to_builtins
-from msgspec.structs import replace
+from msgspec import Meta, Struct, StructMeta, ValidationError, convert, to_builtins
+from msgspec.structs import fields, replace
 
 from splinecli.errors import SplinecliError, UsageError, check_one_of
 
 ARGUMENTS = "Arguments"
 # The panels of the help, in order
-PANELS = (
-    *(
-        ARGUMENTS,
-        "Captures",
-        "Input",
-        "Settings",
-        "Pixels",
-        "Scenes",
-        "Length",
-        "Lights",
-        "Light intensities",
-    ),
-    *("Method", "Output", "Speed", "Processes and machines"),
-)
+PANELS = [
+    *(ARGUMENTS, "Captures", "Input", "Settings", "Pixels", "Scenes", "Length", "Lights"),
+    *("Light intensities", "Method", "Output", "Speed", "Processes and machines"),
+]
 PATH = object()
 FileName = Annotated[str, PATH]  # a path that is stored as text
 Count = Annotated[int, Meta(ge=1)]
@@ -45,6 +46,7 @@ NotNegative = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 BelowOne = Annotated[float, Meta(ge=0, lt=1)]
+Conflicts = tuple[tuple[str, str, str], ...]
 Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 
 
@@ -53,20 +55,21 @@ class Option:
     """How a field is given on the command line: as `--field-name`, or by `names`.
 
     panel: one of PANELS. metavar: placeholder for the value; "" for a flag or a choice. default:
-    text for a default of None in the help. complete: the values for shell completion, or a function
-    that returns them. parse: converts a text to the field's value, or each text if the option may
-    be `repeated`. items: the names allowed in a list "a,b".
+    text for a default of None in the help. names: such as "--output -o". complete: the values for
+    shell completion, or a function that returns them. parse: converts a text to the field's value,
+    or each text of an option that may be repeated: any with a tuple, but without items. items: the
+    names allowed in a list "a,b". value: the default of the field, or NODEFAULT.
     """
 
     panel: str
-    metavar: str
     help: str
+    metavar: str = ""
     default: str | None = None
-    names: tuple[str, ...] = ()
+    names: str = ""
     complete: Callable[..., list[str]] | Collection[str] | None = None
     parse: Callable[[str], Any] | None = None
     items: Collection[str] = ()
-    repeated: bool = False
+    value: Any = None
 
     @property
     def is_argument(self) -> bool:
@@ -84,27 +87,58 @@ class Option:
             if not names:
                 raise UsageError(f"{title} is empty; expected a list of {', '.join(self.items)}")
             return names
-        if self.parse is None:
-            return tuple(given) if isinstance(given, list) else given
-        return tuple(map(self.parse, given)) if self.repeated else self.parse(given)
+        parse = self.parse or (lambda value: value)
+        return tuple(map(parse, given)) if isinstance(given, list) else parse(given)
 
 
-class Record(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A frozen record of options, whose fields are validated. Raises UsageError for an invalid
-    value.
+# of any type, so that they can stand for the default of a field; a flag is off by default
+option: Any = Option
+flag: Any = partial(Option, value=False)
+
+
+class _RecordMeta(StructMeta):
+    """Replaces the options of a record by the defaults of their fields."""
+
+    def __new__(
+        cls, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **settings: Any
+    ) -> Any:
+        options = {key: value for key, value in namespace.items() if isinstance(value, Option)}
+        made: Any = super().__new__(
+            cls,
+            name,
+            bases,
+            namespace | {key: each.value for key, each in options.items()},
+            **settings,
+        )
+        made.OPTIONS = getattr(made, "OPTIONS", {}) | options
+        return made
+
+
+class Record(Struct, metaclass=_RecordMeta, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A frozen record of options, whose fields are validated.
+
+    Raises UsageError for an invalid value, or for two options that cannot be used together.
     """
 
+    CONFLICTS: ClassVar[Conflicts] = ()
+    """Pairs of fields that cannot both differ from their defaults, each with a hint."""
+
     def __post_init__(self) -> None:
+        titles = {}
         for name, kind in field_types(type(self)).items():
             option, value = option_of(kind), getattr(self, name)
-            fit(
-                kind,
-                value,
-                f"option {name!r}" if option is None else long_name(name, option),
-                UsageError,
-            )
-            for item in value if option is not None and option.items else ():
-                check_one_of(name.removesuffix("s"), item, option.items)  # type: ignore[union-attr]
+            title = f"option {name!r}" if option is None else long_name(name, option)
+            converted(kind, value, title, UsageError)
+            if option is not None:
+                for item in value if option.items else ():
+                    check_one_of(name.removesuffix("s"), item, option.items)
+                titles[name] = title
+        given = {field.name for field in fields(self) if getattr(self, field.name) != field.default}
+        for first, second, hint in self.CONFLICTS:
+            if first in given and second in given:
+                raise UsageError(
+                    f"{titles[first]} and {titles[second]} contradict each other", hint=hint
+                )
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with new values for some fields."""
@@ -120,44 +154,44 @@ class Record(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Return the record from the result of `as_dict`. Raises UsageError for an unknown name or
-        an invalid value.
+        """Return the record from the result of `as_dict`.
+
+        Raises UsageError for an unknown name or an invalid value.
         """
         return cls(**settings(cls, values, "option", UsageError))
 
     @classmethod
     def from_arguments(cls, given: dict[str, Any]) -> Self:
-        """Remove the record's command-line values from `given`, and return the record. Raises
-        UsageError.
+        """Remove the record's command-line values from `given`, and return the record.
+
+        Raises UsageError.
         """
         values: dict[str, Any] = {}
         for name, kind in field_types(cls).items():
-            option = option_of(kind)
-            if option is None and isinstance(kind, type) and issubclass(kind, Record):
+            if (option := option_of(kind)) is not None:
+                if (value := given.pop(name)) is not None:
+                    values[name] = _from_typer(kind, option, value, long_name(name, option))
+                elif option.is_argument:
+                    values[name] = ()
+            elif isinstance(kind, type) and issubclass(kind, Record):
                 values[name] = kind.from_arguments(given)
-            elif option is not None and (value := given.pop(name)) is not None:
-                title = long_name(name, option)
-                value = option.value_of(value, title)
-                if (number := number_of(kind)) is not None and option.parse is None:
-                    one: Any = Annotated[number, limits(kind)]
-                    items = [
-                        fit(one, item, title, UsageError, strict=False) for item in _each(value)
-                    ]
-                    value = tuple(items) if option.repeated else items[0]
-                is_name = PATH in _metadata(kind)
-                if (
-                    (is_name or isinstance(value, Path))
-                    and not option.is_argument
-                    and str(value).startswith("-")
-                ):
-                    raise UsageError(
-                        f"{title} needs a file or folder, found {value}",
-                        hint="Name it after the option",
-                    )
-                values[name] = str(value) if is_name else value
-            elif option is not None and option.is_argument and option.repeated:
-                values[name] = ()
         return cls(**values)
+
+
+def _from_typer(kind: Any, option: Option, given: Any, title: str) -> Any:
+    """Convert Typer's value to a value of the field's type. Raises UsageError."""
+    value = option.value_of(given, title)
+    if (number := number_of(kind)) is not None and option.parse is None:
+        one: Any = Annotated[number, limits(kind)]
+        items = [converted(one, item, title, UsageError, strict=False) for item in _each(value)]
+        value = tuple(items) if isinstance(value, tuple) else items[0]
+    is_name = PATH in _metadata(kind)
+    is_file = (is_name or isinstance(value, Path)) and not option.is_argument
+    if is_file and str(value).startswith("-"):
+        raise UsageError(
+            f"{title} needs a file or folder, found {value}", hint="Name it after the option"
+        )
+    return str(value) if is_name else value
 
 
 @lru_cache
@@ -165,7 +199,9 @@ def field_types(record: type) -> dict[str, Any]:
     """Return the annotation of each field of a record or dataclass."""
     hints = get_type_hints(record, include_extras=True)
     names = record.__dataclass_fields__ if is_dataclass(record) else record.__struct_fields__  # type: ignore[attr-defined]
-    return {name: hints[name] for name in names}
+    options = getattr(record, "OPTIONS", {})
+    kinds = {name: hints[name] for name in names}
+    return {n: Annotated[kind, options[n]] if n in options else kind for n, kind in kinds.items()}
 
 
 def settings(
@@ -181,17 +217,18 @@ def settings(
         if name not in kinds:
             raise error(f"unknown {noun} {name!r}; known are {', '.join(sorted(kinds))}")
     return {
-        name: fit(kinds[name], value, f"{noun} {name!r}", error) for name, value in values.items()
+        name: converted(kinds[name], value, f"{noun} {name!r}", error)
+        for name, value in values.items()
     }
 
 
-def fit(
+def converted(
     kind: Any, value: Any, title: str, error: type[SplinecliError], *, strict: bool = True
 ) -> Any:
-    """Convert a value to a type, such as a list to a tuple. Raises the given error, which begins
-    with the title.
+    """Convert a value to a type, such as a list to a tuple.
 
-    Unless `strict` is set, numbers may be given as text.
+    Raises the given error, which begins with the title. Unless `strict` is set, numbers may be
+    given as text.
     """
     if isinstance(kind, type) and is_dataclass(kind) and isinstance(value, kind):
         return value
@@ -200,21 +237,20 @@ def fit(
         items = found.values() if isinstance(found, dict) else _each(found)
         if all(isfinite(item) for item in items if isinstance(item, float)):
             return found
-    raise error(f"{title} is {value!r}; expected {in_words(kind)}")
+    raise error(f"{title} is {value!r}; expected {kind_in_words(kind)}")
 
 
 def option_of(kind: Any) -> Option | None:
     """Return how a field of this annotation is given on the command line."""
-    return next(
-        (item for item in getattr(kind, "__metadata__", ()) if isinstance(item, Option)), None
-    )
+    metadata = getattr(kind, "__metadata__", ())
+    return next((item for item in metadata if isinstance(item, Option)), None)
 
 
 def long_name(name: str, option: Option) -> str:
     """Return the long name of an option, such as --n-lights, or the name of an argument."""
     if option.is_argument:
         return option.metavar
-    return option.names[0].split("/")[0] if option.names else f"--{name.replace('_', '-')}"
+    return re.split("[ /]", option.names)[0] or f"--{name.replace('_', '-')}"
 
 
 def limits(kind: Any) -> Meta:
@@ -229,9 +265,7 @@ def _metadata(kind: Any) -> Iterator[Any]:
 
 
 def plain(kind: Any) -> Any:
-    """Return a type without annotations; Path for a path that is stored as text, and a list for a
-    tuple.
-    """
+    """Return a type without annotations, with Path for a stored path and list for a tuple."""
     if get_origin(kind) is Annotated:
         return Path if PATH in kind.__metadata__ else plain(get_args(kind)[0])
     if get_origin(kind) in (Union, types.UnionType):
@@ -239,7 +273,7 @@ def plain(kind: Any) -> Any:
     return list[plain(get_args(kind)[0])] if get_origin(kind) is tuple else kind  # type: ignore[misc]
 
 
-def in_words(kind: Any) -> str:
+def kind_in_words(kind: Any) -> str:
     """Describe the values of a type, such as "a number from 0 to 1"."""
     bare = plain(kind)
     if get_origin(bare) is Union:
@@ -249,7 +283,7 @@ def in_words(kind: Any) -> str:
         return " or ".join(names) if len(names) < 3 else f"one of {', '.join(names)}"
     if get_origin(bare) in (list, dict):
         whole = "list" if get_origin(bare) is list else "table"
-        return f"a {whole}, each {in_words(Annotated[get_args(bare)[-1], limits(kind)])}"
+        return f"a {whole}, each {kind_in_words(Annotated[get_args(bare)[-1], limits(kind)])}"
     if bare not in (int, float):
         return {bool: "true or false", str: "a text", Path: "a text"}.get(
             bare, "a table of settings"
@@ -279,9 +313,7 @@ def number_of(kind: Any) -> type | None:
 
 
 def complete_list(items: Iterable[str]) -> Callable[[str], list[str]]:
-    """Return the completions of a list "a,b": the typed items, followed by each possible item after
-    the last comma.
-    """
+    """Return a function that completes a list "a,b" by each possible next item."""
 
     def complete(incomplete: str) -> list[str]:
         *typed, _ = incomplete.split(",")

@@ -6,6 +6,7 @@ generate the table in docs/warnings.md (docs/make_tables.py), and determine the 
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 from splinecli.maths import Float64Array
@@ -56,7 +57,9 @@ class CaptureWarning:
         return self.text
 
 
-# The rows form a table: code, meaning, remedy, severity.
+fault = partial(WarningKind, severity="error")
+
+# The rows form a table: code, meaning, remedy. A fault means that an input is probably wrong.
 AMBIENT_SUBTRACTED = WarningKind(
     "ambient_subtracted", "The image `ambient.*` in the folder was subtracted"
 )
@@ -65,13 +68,11 @@ BLACK_PIXELS = WarningKind(
     "Over 1 % of the pixels are black under every light",
     "Use a mask, or a longer exposure",
 )
-CONSTANT_LIGHT = WarningKind(
+CONSTANT_LIGHT = fault(
     "constant_light",
     "The images look as if they contained [ambient"
-    " light](input-checks.md#other-interpretations-of-the-images) or a "
-    "black level",
+    " light](input-checks.md#other-interpretations-of-the-images) or a black level",
     "`--ambient IMAGE`, taken with all lamps off",
-    severity="error",
 )
 DARK_IMAGES = WarningKind(
     "dark_images", "The images use a small part of the range", "Use a longer exposure"
@@ -123,40 +124,32 @@ FEW_LIGHTS = WarningKind("few_lights", "There are fewer than eight lights", "Add
 GRAY_MATERIAL = WarningKind(
     "gray_material", "With `--maps material`: gray images have no base colour, only brightness"
 )
-GROUND_TRUTH_FRAME = WarningKind(
+GROUND_TRUTH_FRAME = fault(
     "ground_truth_frame",
     "The ground truth fits the images only if x or y is negated, or x and y are exchanged",
     "Convert it to x right, y up, z to the camera; if the lights are wrong, `--light-frame`",
-    severity="error",
 )
-GROUND_TRUTH_SHIFTED = WarningKind(
+GROUND_TRUTH_SHIFTED = fault(
     "ground_truth_shifted",
     "The ground truth fits the images only after a shift",
     "Align it with the images",
-    severity="error",
 )
 GROUND_TRUTH_UPSIDE_DOWN = WarningKind(
     "ground_truth_upside_down", "The ground truth was upside down and was flipped"
 )
-GROUND_TRUTH_Z = WarningKind(
-    "ground_truth_z",
-    "The ground truth points away from the camera",
-    "Negate its z",
-    severity="error",
+GROUND_TRUTH_Z = fault(
+    "ground_truth_z", "The ground truth points away from the camera", "Negate its z"
 )
-IMAGE_INCONSISTENT = WarningKind(
+IMAGE_INCONSISTENT = fault(
     "image_inconsistent",
     "One image [contradicts the others](input-checks.md#one-odd-image)",
     "Photograph it again, or leave it out with `--light-indices`",
-    severity="error",
 )
-IMAGE_SCALE = WarningKind(
+IMAGE_SCALE = fault(
     "image_scale",
     "One image is 16, 64 or 256 times darker or brighter than the others predict, as with a 12-bit"
-    " image among "
-    "16-bit ones",
+    " image among 16-bit ones",
     "Save all images with the same bit depth",
-    severity="error",
 )
 IMAGES_ALIGNED = WarningKind(
     "images_aligned",
@@ -168,37 +161,32 @@ IMAGES_LEFT_OUT = WarningKind(
     " another size",
     "Check names and sizes",
 )
-IMAGES_SHIFTED = WarningKind(
+IMAGES_SHIFTED = fault(
     "images_shifted",
     "Images are [shifted against the others](input-checks.md#shifted-images)",
     "[`--align`](image-preparation.md#moved-images); next time, photograph from a tripod",
-    severity="error",
 )
-LAMP_DISTANCE = WarningKind(
+LAMP_DISTANCE = fault(
     "lamp_distance",
     "A lamp is nearer than the object is wide, or hundreds of widths away",
     "Use one unit for lamps and pixel size",
-    severity="error",
 )
-LIGHT_COLOURS = WarningKind(
+LIGHT_COLOURS = fault(
     "light_colours",
     "The lamps have different colours, and some lack a channel, so the colours cannot be divided"
     " out",
     "White lamps, or RGB intensities",
-    severity="error",
 )
-LIGHT_FRAME = WarningKind(
+LIGHT_FRAME = fault(
     "light_frame",
     "The lights are probably in [another frame](input-checks.md#wrong-light-directions), rotated,"
     " or half vectors",
     "`--light-frame` or `info --mended-lights`, as the warning says",
-    severity="error",
 )
-LIGHT_ORDER = WarningKind(
+LIGHT_ORDER = fault(
     "light_order",
     "The order of the lights probably differs from that of the images",
     "Correct the light file",
-    severity="error",
 )
 LIGHTS_ILL_CONDITIONED = WarningKind(
     "lights_ill_conditioned",
@@ -208,8 +196,7 @@ LIGHTS_ILL_CONDITIONED = WarningKind(
 LIGHTS_IN_CHANNELS = WarningKind(
     "lights_in_channels",
     "The channels are read as images under three lamps, as `--lights-in-channels` requests;"
-    " coloured objects get wrong "
-    "normals",
+    " coloured objects get wrong normals",
     "A [crosstalk matrix](coloured-lights.md), and gray objects",
 )
 LIGHTS_MATCHED = WarningKind(
@@ -223,28 +210,24 @@ LIGHTS_NEAR_AXIS = WarningKind(
 LIGHTS_UNCHECKED = WarningKind(
     "lights_unchecked",
     "Shadows that the lights should cast are missing; with `--strict`, also if the order or the"
-    " frame of the "
-    "lights [cannot be checked](input-checks.md#wrong-light-directions)",
+    " frame of the lights [cannot be checked](input-checks.md#wrong-light-directions)",
     "Compare bumps and hollows with the object",
 )
-LOW_CONFIDENCE = WarningKind(
+LOW_CONFIDENCE = fault(
     "low_confidence",
     "The network predicts large errors for nearly all normals",
     "Check the lights, the mask and the images",
-    severity="error",
 )
 MASK_CHOICE = WarningKind(
     "mask_choice",
     "Without a `mask.*`, a picture with the word `mask` in its name, or the alpha channel of the"
-    " images, is used as "
-    "the mask; if there are several such pictures, they are ignored",
+    " images, is used as the mask; if there are several such pictures, they are ignored",
     "`--mask FILE` for another one",
 )
-MASK_INVERTED = WarningKind(
+MASK_INVERTED = fault(
     "mask_inverted",
     "The mask excludes a bright area in the middle",
     "Invert it: white on the object",
-    severity="error",
 )
 NEAR_LAMPS = WarningKind(
     "near_lamps",
@@ -252,23 +235,21 @@ NEAR_LAMPS = WarningKind(
     " treated as distant",
     "`--light-positions FILE`, or leave `--lights` out",
 )
-NEAR_LIGHTS_SUSPECTED = WarningKind(
+NEAR_LIGHTS_SUSPECTED = fault(
     "near_lights_suspected",
     "The images fit [near lamps](input-checks.md#other-interpretations-of-the-images) much better",
     "[Specify their positions](near-lamps.md)",
-    severity="error",
 )
 NO_MASK = WarningKind(
     "no_mask",
     "There is no mask that excludes pixels, and most pixels are nearly black",
     "`--auto-mask`, or a mask",
 )
-NONLINEARITY_SUSPECTED = WarningKind(
+NONLINEARITY_SUSPECTED = fault(
     "nonlinearity_suspected",
-    "The images [look encoded](input-checks.md#other-interpretations-of-the-images),"
-    " but are read as linear",
+    "The images [look encoded](input-checks.md#other-interpretations-of-the-images), but are read"
+    " as linear",
     "`--transfer srgb` or `gamma:2.2`",
-    severity="error",
 )
 NOT_DISTILLED = WarningKind(
     "not_distilled",
@@ -288,11 +269,8 @@ REFINED_LIGHTS = WarningKind(
 REFINEMENT_REJECTED = WarningKind(
     "refinement_rejected", "`--refine-lights` found no better directions"
 )
-REPEATED_IMAGES = WarningKind(
-    "repeated_images",
-    "Two images are identical, but their lights differ",
-    "Replace one of them",
-    severity="error",
+REPEATED_IMAGES = fault(
+    "repeated_images", "Two images are identical, but their lights differ", "Replace one of them"
 )
 ROUGH_LIGHTS = WarningKind(
     "rough_lights",
@@ -302,19 +280,17 @@ ROUGH_LIGHTS = WarningKind(
 ROUGHNESS_UNDETERMINED = WarningKind(
     "roughness_undetermined",
     "With `--maps material`: there are too few highlights, or the normals are too uncertain, to"
-    " [determine the "
-    "roughness](materials.md#limits)",
+    " [determine the roughness](materials.md#limits)",
     "Add lights, some of them near the camera axis",
 )
 SATURATED = WarningKind(
     "saturated", "Over 1 % of the observations are saturated", "Use a shorter exposure"
 )
-UNEQUAL_INTENSITIES = WarningKind(
+UNEQUAL_INTENSITIES = fault(
     "unequal_intensities",
     "Light intensities look unequal, but the images do not determine them; or given intensities do"
     " not fit the images",
     "[Measure them](capture-and-calibrate.md#light-intensities), or correct the file",
-    severity="error",
 )
 UNTRAINED_LIGHTS = WarningKind(
     "untrained_lights",
@@ -344,18 +320,22 @@ def mask_inverted(name: str) -> CaptureWarning:
 
 def eight_bit(any_8_bit: bool) -> list[CaptureWarning]:
     """Warn of images with 8 bits, if there are any."""
-    text = "The images have 8 bits; 16-bit linear images give better normals."
-    return [CaptureWarning(EIGHT_BIT, text)] if any_8_bit else []
+    return (
+        [
+            CaptureWarning(
+                EIGHT_BIT, "The images have 8 bits; 16-bit linear images give better normals."
+            )
+        ]
+        if any_8_bit
+        else []
+    )
 
 
 def estimated_lights(errors_deg: Float64Array) -> CaptureWarning:
-    """Report that the light directions were estimated from the images, with expected errors (F,) in
-    degrees.
-    """
+    """Report that the light directions were estimated, with expected errors (F,) in degrees."""
     return CaptureWarning(
         ESTIMATED_LIGHTS,
         "The light directions were estimated from the images. Their expected error is"
-        f" {errors_deg.mean():.0f} degrees"
-        f" on average and {errors_deg.max():.0f} degrees for the worst one; the normals inherit"
-        " these errors.",
+        f" {errors_deg.mean():.0f} degrees on average and {errors_deg.max():.0f} degrees for the"
+        " worst one; the normals inherit these errors.",
     )

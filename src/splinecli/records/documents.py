@@ -1,5 +1,6 @@
-"""The documents that commands write and print as JSON; docs/reports.schema.json is generated from
-them.
+"""The documents that commands write and print as JSON, from which the schema is generated.
+
+It is docs/reports.schema.json.
 """
 
 from __future__ import annotations
@@ -302,9 +303,8 @@ def json_schema() -> dict[str, Any]:
             part["description"] = " ".join(part["description"].split())
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "Documents of splinecli: report.json, surface.json, results.json, and"
-        " the document that replaces them"
-        " after a failure",
+        "title": "Documents of splinecli: report.json, surface.json, results.json, and the"
+        " document that replaces them after a failure",
         "anyOf": list(references),
         "$defs": parts,
     }

@@ -1,5 +1,4 @@
-"""The files that splinecli writes for users: their names, and one row of MAPS for each optional map
-of `infer`.
+"""The files that splinecli writes for users, and one row of MAPS for each optional map.
 
 The row determines how the map is computed, written, read, drawn and shown, how much memory it
 needs, and that its pictures are not read as photographs. The functions that make and draw a map are
@@ -29,13 +28,7 @@ REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
 FOUND_LIGHTS = ("light_directions.txt", "light_intensities.txt", "lights.png")
 FOUND_DIRECTIONS, FOUND_INTENSITIES, LIGHT_PLOT = FOUND_LIGHTS
 # of the other commands
-PLOTS = (
-    "calibration.png",
-    "light_noise.png",
-    "contact_sheet.png",
-    "curves.png",
-    "maps.png",
-)
+PLOTS = ("calibration.png", "light_noise.png", "contact_sheet.png", "curves.png", "maps.png")
 CALIBRATION, LIGHT_NOISE_PLOT, CONTACT_SHEET, CURVES, TRAINING_MAPS = PLOTS
 # per pixel of the mask, for integration or for the mesh and its files, whichever needs more
 BYTES_OF_SURFACE = 600
@@ -54,10 +47,7 @@ SURFACE_FILES = {
 and a gloss.
 """
 # of `integrate --level`
-LEVEL_NORMALS = LEVEL_MAP, LEVEL_PICTURE = (
-    "level_normals.npy",
-    "level_normals.png",
-)
+LEVEL_NORMALS = LEVEL_MAP, LEVEL_PICTURE = ("level_normals.npy", "level_normals.png")
 SURFACE_REPORT = "surface.json"  # the report that `integrate` writes beside them
 
 
@@ -117,8 +107,9 @@ class OutputMap:
 
 @dataclass(frozen=True)
 class MapPart:
-    """A map that consists of some channels of another one, (H, W) if there is only one, and is
-    written with it.
+    """Some channels of a map that are written with it as a map of their own.
+
+    Its shape is (H, W) if there is only one.
     """
 
     name: str
@@ -136,9 +127,8 @@ _ROWS = (
     # the colours of two images, sums and the map
     OutputMap(
         name="albedo",
-        content="diffuse albedo without highlights and cast shadows; float32, H x W x 3,"
-        " linear RGB, up to a factor."
-        " The picture is 8-bit sRGB, the EXR file float16",
+        content="diffuse albedo without highlights and cast shadows; float32, H x W x 3, linear"
+        " RGB, up to a factor. The picture is 8-bit sRGB, the EXR file float16",
         unit="linear RGB",
         suffixes=("npy", "exr", "png"),
         caption="Diffuse albedo, scaled so that the brightest 1 % of the pixels are white",
@@ -148,12 +138,11 @@ _ROWS = (
     ),
     OutputMap(
         name="confidence",
-        content="the probability that a normal has an error of at most 5 degrees; float32,"
-        " H x W, zero outside the"
-        " mask; white is 1",
+        content="the probability that a normal has an error of at most 5 degrees; float32, H x W,"
+        " zero outside the mask; white is 1",
         suffixes=("npy", "png"),
-        caption="Confidence: the probability that the normal is at most 5° off, from 0"
-        " (black) to 1 (white)",
+        caption="Confidence: the probability that the normal is at most 5° off, from 0 (black) to"
+        " 1 (white)",
         needs_confidence=True,
     ),
     OutputMap(
@@ -169,20 +158,18 @@ _ROWS = (
     ),
     OutputMap(
         name="curvature",
-        content="mean and Gaussian curvature from the normals, filtered with 2 pixels;"
-        " float32, H x W x 2, in 1/pixel"
-        " and 1/pixel^2. Bumps are positive. The picture shows the mean curvature:"
-        " gray is 0, white 0.05 per pixel",
+        content="mean and Gaussian curvature from the normals, filtered with 2 pixels; float32, H"
+        " x W x 2, in 1/pixel and 1/pixel^2. Bumps are positive. The picture shows the"
+        " mean curvature: gray is 0, white 0.05 per pixel",
         unit="mean and Gaussian curvature, 1/pixel and 1/pixel^2",
         scale=0.05,
         scale_text="mean curvature, black -{scale}, gray 0, white {scale} per pixel",
     ),
     OutputMap(
         name="relief",
-        content="heights without the overall shape; float32, H x W, in pixels, NaN outside"
-        " the mask. The high-pass"
-        " filter halves the amplitude of 64-pixel wavelengths. In the picture,"
-        " gray is 0 and white 1 pixel",
+        content="heights without the overall shape; float32, H x W, in pixels, NaN outside the"
+        " mask. The high-pass filter halves the amplitude of 64-pixel wavelengths. In the"
+        " picture, gray is 0 and white 1 pixel",
         unit="heights in pixels",
         scale=1.0,
         scale_text="height, black -{scale}, gray 0, white {scale} pixels",
@@ -190,11 +177,9 @@ _ROWS = (
     ),
     OutputMap(
         name="material",
-        content="base colour, roughness, metalness, specular reflection and their"
-        " confidence; float32,"
-        " zero outside the mask. The pictures have 8 bits: base colour in sRGB,"
-        " and glTF's texture with roughness in"
-        " green and metalness in blue",
+        content="base colour, roughness, metalness, specular reflection and their confidence;"
+        " float32, zero outside the mask. The pictures have 8 bits: base colour in sRGB,"
+        " and glTF's texture with roughness in green and metalness in blue",
         reads_images=True,
         bytes_per_pixel=170,  # the maps, and the gloss of each pixel
         bytes_per_observation=5,
@@ -215,8 +200,9 @@ MAPS = {row.name: row for row in _ROWS}
 
 
 def own_files() -> list[str]:
-    """Return the names of all files that `infer` and `integrate` may write to a folder, except
-    FOUND_LIGHTS.
+    """Return the names of all files, except FOUND_LIGHTS, that may be written to a folder.
+
+    The commands are `infer` and `integrate`.
     """
     maps = (name for row in MAPS.values() for name in row.files.values())
     surface = (*file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS, SURFACE_REPORT)

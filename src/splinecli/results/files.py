@@ -1,6 +1,4 @@
-"""Write the results of `infer` for a capture: the report and the files,
-either all of them or none.
-"""
+"""Write the results of `infer` for a capture, either all of them or none."""
 
 from __future__ import annotations
 
@@ -61,11 +59,8 @@ def report_of(
     result of AlignedImages.as_dict, or None.
     """
     capture = estimate.capture
-    intensities, errors, expected = (
-        capture.estimated_intensities,
-        estimate.errors,
-        estimate.expected_under_5,
-    )
+    intensities, errors = capture.estimated_intensities, estimate.errors
+    expected, light_errors_deg = estimate.expected_under_5, capture.light_errors_deg
     height, width = capture.mask.shape
     return EstimateReport(
         schema=3,
@@ -76,9 +71,7 @@ def report_of(
         light_indices=list(capture.light_indices),
         light_file=None if light_file is None else str(light_file.absolute()),
         light_directions=capture.light_directions.round(6).tolist(),
-        light_errors_deg=None
-        if capture.light_errors_deg is None
-        else capture.light_errors_deg.round(2).tolist(),
+        light_errors_deg=None if light_errors_deg is None else light_errors_deg.round(2).tolist(),
         near_lamps=None if capture.lamps is None else NearLampsReport(**capture.lamps.as_dict()),
         camera_matrix=None if capture.camera_matrix is None else capture.camera_matrix.tolist(),
         estimated_intensities=None if intensities is None else intensities.round(4).tolist(),
@@ -88,9 +81,7 @@ def report_of(
         precision=estimator.precision,
         distillation=None if distillation is None else convert(distillation, Distillation),
         peak_memory_mib=peak_memory_mib(),
-        warnings=[
-            WarningReport(code=warning.code, text=warning.text) for warning in capture.warnings
-        ],
+        warnings=[WarningReport(code=each.code, text=each.text) for each in capture.warnings],
         angular_error_deg=None
         if errors is None
         else AngularErrors(*(round(value, 4) for value in astuple(errors))),
@@ -109,9 +100,7 @@ def report_of(
 
 
 def peak_memory_mib() -> int | None:
-    """Return the peak memory usage of this process in MiB, or None if the system does not report
-    it.
-    """
+    """Return the peak memory usage of this process in MiB, or None if it is not reported."""
     try:
         import resource
     except ImportError:  # Windows
@@ -127,20 +116,21 @@ class UnfinishedError(ValueError):
     """A folder does not contain a complete set of results."""
 
 
+UNUSABLE = (OSError, ValueError, KeyError, TypeError, AttributeError)
+"""The errors of a report that cannot be used, such as one that was edited."""
+
+
 def write_estimate(
     report: dict[str, Any], folder: Path, files: Iterable[tuple[str, Content]], clock: Clock
 ) -> dict[str, Any]:
-    """Write the results of a capture to `folder` and return the finished report; `report` comes
-    from report_of.
+    """Write the results of a capture to `folder` and return the finished report.
 
-    The files, which are named in own_files() and FOUND_LIGHTS, replace the files of an earlier run
-    (see new_files). The caller has locked the folder. Writing is the clock's last stage. Raises
-    OutputError if a file cannot be written.
+    `report` comes from report_of. The files, which are named in own_files() and FOUND_LIGHTS,
+    replace the files of an earlier run (see new_files). The caller has locked the folder. Writing
+    is the clock's last stage. Raises OutputError if a file cannot be written.
     """
     # The user may have edited the mask of an earlier run and passed it to this run: keep it.
-    stale = [
-        name for name in output_files.own_files() if name != output_files.FOUND_MASK
-    ] + own_light_files(folder)
+    stale = {*output_files.own_files(), *own_light_files(folder)} - {output_files.FOUND_MASK}
     with new_files(folder, report=REPORT, stale=stale) as new:
         for name, content in files:
             new.write(name, content)
@@ -157,35 +147,27 @@ def write_estimate(
 
 
 def own_light_files(folder: Path) -> list[str]:
-    """Return the FOUND_LIGHTS in a folder of results that, according to its report, an earlier run
-    wrote.
-    """
+    """Return the FOUND_LIGHTS that an earlier run wrote to a folder, according to its report."""
     try:
         return [name for name in output_files.FOUND_LIGHTS if name in read_report(folder)["files"]]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except UNUSABLE:
         return []
 
 
 def read_report(folder: Path) -> dict[str, Any]:
-    """Return the report in a folder of results if its list of files is correct. Links are not
-    followed.
+    """Return the report in a folder of results if its list of files is correct.
 
-    The rest of the report is not checked.
+    Links are not followed. The rest of the report is not checked.
 
     Raises:
         UnfinishedError: the report or a file is missing, or a file has another size.
-        OSError, ValueError, KeyError, TypeError, AttributeError: the report cannot be used.
+        UNUSABLE: the report cannot be used.
     """
     if not is_plain(folder / REPORT):
         raise UnfinishedError(f"has no {REPORT}")
     report: dict[str, Any] = read_json(folder / REPORT)
     files, sizes = report["files"], report.get("file_sizes", {})  # earlier versions stated no sizes
-    if not (
-        isinstance(files, list)
-        and all(isinstance(name, str) for name in files)
-        and isinstance(sizes, dict)
-    ):
-        raise ValueError("the report has no list of files, or no sizes")
+    convert((files, sizes), tuple[list[str], dict[str, Any]])  # raises ValueError
     # Users may edit the mask, and `integrate` may have replaced the surface.
     surface_files = file_names(tuple(SURFACE_FILES)) if is_plain(folder / SURFACE_REPORT) else ()
     changeable = (output_files.FOUND_MASK, *surface_files)
@@ -203,9 +185,7 @@ def read_report(folder: Path) -> dict[str, Any]:
 
 
 def normal_files(estimate: NormalEstimate, formats: Sequence[str], convention: Convention) -> Files:
-    """Yield the normal map in the given formats, which are keys of NORMALS, and the error map if
-    available.
-    """
+    """Yield the normal map in these formats (keys of NORMALS), and the error map if known."""
     for form in formats:
         yield output_files.NORMALS[form], encode_normals(estimate, form, convention)
     if estimate.error_map_deg is not None:
@@ -213,16 +193,17 @@ def normal_files(estimate: NormalEstimate, formats: Sequence[str], convention: C
 
 
 def encode_normals(estimate: NormalEstimate, form: str, convention: Convention) -> Content:
-    """Return the file of the normal map: a 16-bit or 8-bit PNG picture, or float32 NPY, TIFF or
-    EXR.
+    """Return the file of the normal map: a PNG picture, or float32 NPY, TIFF or EXR.
 
-    EXR has the same colours as the pictures, (n + 1) / 2 and black outside the mask, because
-    renderers expect them.
+    The picture has 16 or 8 bits. EXR has the same colours as the pictures, (n + 1) / 2 and black
+    outside the mask, because renderers expect them.
     """
     if form in ("png", "png8"):
-        bits = 8 if form == "png8" else 16
         picture = encode_picture(
-            estimate.normal_map, estimate.capture.mask, bits=bits, convention=convention
+            estimate.normal_map,
+            estimate.capture.mask,
+            bits=8 if form == "png8" else 16,
+            convention=convention,
         )
         return encode_png(picture, {"normals": describe(convention)})
     if form == "npy":
@@ -241,13 +222,9 @@ def encode_normals(estimate: NormalEstimate, form: str, convention: Convention) 
 
 
 def light_files(capture: Capture, plot: bytes) -> Files:
-    """Yield the lights estimated from the images, in the format of `--lights` and `--intensities`,
-    and their plot.
-    """
+    """Yield the lights estimated from the images, as `--lights` reads them, and their plot."""
     yield output_files.FOUND_DIRECTIONS, rows_text(capture.light_directions)
-    if capture.estimated_intensities is not None:
-        yield (
-            output_files.FOUND_INTENSITIES,
-            rows_text(np.repeat(capture.estimated_intensities[:, None], 3, axis=1)),
-        )
+    if (intensities := capture.estimated_intensities) is not None:
+        text = rows_text(np.repeat(intensities[:, None], 3, axis=1))
+        yield output_files.FOUND_INTENSITIES, text
     yield output_files.LIGHT_PLOT, plot

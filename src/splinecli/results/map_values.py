@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture, CaptureSource
 from splinecli.capture.linearise import StoredPixels, take_pixels
+from splinecli.maths import Picture
 from splinecli.maths.normals import curvature_of_normals, gradient_of_normals
 from splinecli.pictures.maps import (
-    Picture,
     albedo_picture,
     confidence_picture,
     preview_picture,

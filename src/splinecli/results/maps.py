@@ -6,11 +6,10 @@ from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture import CaptureSource
-from splinecli.maths import Floats
-from splinecli.pictures.maps import Picture, encode_png
+from splinecli.maths import Bools, Float32Array, Floats, Picture
+from splinecli.pictures.maps import encode_png
 from splinecli.records.output_files import MAPS, OutputMap
 from splinecli.results import material  # noqa: F401 - its map is in MAP_FUNCTIONS once it is imported
 from splinecli.results.map_values import MAP_FUNCTIONS, Progress
@@ -22,8 +21,9 @@ if TYPE_CHECKING:
 
 
 def chosen_maps(names: Collection[str], *, page: bool = False) -> list[OutputMap]:
-    """Return the rows with these names and the rows shown on the page, with the most
-    memory-intensive ones last.
+    """Return the rows with these names and the rows shown on the page.
+
+    The rows that take the most memory come last.
     """
     rows = [row for row in MAPS.values() if row.name in names or (page and row.caption)]
     return sorted(rows, key=lambda row: row.bytes_per_pixel)
@@ -34,16 +34,15 @@ def make_map(
     source: CaptureSource,
     estimate: NormalEstimate,
     progress: Progress = lambda: None,
-) -> NDArray[np.float32] | None:
-    """Return the values of a map, or None if the capture or the method does not provide it. Raises
-    InputError.
+) -> Float32Array | None:
+    """Return the values of a map, or None if the capture or the method does not provide it.
+
+    Raises InputError.
     """
     return MAP_FUNCTIONS[row.name].make(source, estimate, progress)
 
 
-def map_picture(
-    row: OutputMap, values: Floats, mask: NDArray[np.bool_], scale: float | None = None
-) -> Picture:
+def map_picture(row: OutputMap, values: Floats, mask: Bools, scale: float | None = None) -> Picture:
     """Return a picture of a map's values (H, W) or (H, W, C); None uses the row's own scale."""
     scales = [] if row.scale is None else [row.scale if scale is None else scale]
     return MAP_FUNCTIONS[row.name].picture(values, mask, *scales)
@@ -51,22 +50,18 @@ def map_picture(
 
 def map_files(
     row: OutputMap,
-    values: NDArray[np.float32],
-    mask: NDArray[np.bool_],
+    values: Float32Array,
+    mask: Bools,
     formats: Collection[str],
     *,
     scale: float | None = None,
 ) -> Iterator[tuple[str, Content]]:
-    """Yield the files of a map: NPY and PNG whenever the map has them, TIFF and EXR only if they
-    are requested.
-    """
+    """Yield the files of a map; TIFF and EXR only if they are requested."""
     for part in row.parts:
         channels = values[..., part.first : part.last]
         if part.has_values:
-            yield (
-                f"{part.name}.npy",
-                np.squeeze(channels, 2) if channels.shape[2] == 1 else channels,
-            )
+            single = channels.shape[2] == 1
+            yield f"{part.name}.npy", channels[..., 0] if single else channels
         yield f"{part.name}.png", encode_png(MAP_FUNCTIONS[part.name].picture(channels, mask))
     scale = row.scale if scale is None else scale
     for suffix, name in row.files.items():
@@ -75,11 +70,8 @@ def map_files(
         elif suffix == "tiff" and suffix in formats:
             yield name, encode_tiff(values, row.unit)
         elif suffix == "exr" and suffix in formats:
-            largest = np.finfo(np.float16).max
-            yield (
-                name,
-                encode_exr(values.clip(0, largest).astype(np.float16), {"colours": row.unit}),
-            )
+            colours = values.clip(0, np.finfo(np.float16).max).astype(np.float16)
+            yield name, encode_exr(colours, {"colours": row.unit})
         elif suffix == "png":
             texts = {row.name: row.scale_text.format(scale=scale)} if row.scale_text else None
             yield name, encode_png(map_picture(row, values, mask, scale), texts)

@@ -11,9 +11,8 @@ import numpy as np
 from splinecli.capture import CaptureSource
 from splinecli.capture.linearise import take_pixels
 from splinecli.estimate.inference import lighting_on
-from splinecli.maths import Bools, Float32Array
+from splinecli.maths import Bools, Float32Array, Picture
 from splinecli.maths.transfer import encode_srgb
-from splinecli.pictures.maps import Picture
 from splinecli.records.capture_warnings import GRAY_MATERIAL, ROUGHNESS_UNDETERMINED, CaptureWarning
 from splinecli.records.documents import MaterialFacts
 from splinecli.results.map_values import Progress, colours_of_surface, makes
@@ -34,10 +33,9 @@ def base_colour_picture(base_colour: Float32Array, _: Bools) -> Picture:
 
 
 def gloss_picture(values: Float32Array, mask: Bools) -> Picture:
-    """Return glTF's texture (H, W, 3) of roughness and metalness (H, W, 2): in green and blue,
-    linear.
+    """Return glTF's linear texture (H, W, 3) of roughness and metalness (H, W, 2).
 
-    Red is for occlusion in glTF; it is white in the mask.
+    Roughness is in green, metalness in blue. Red is for occlusion in glTF; it is white in the mask.
     """
     return np.asarray(
         np.rint(255 * np.dstack((mask.astype(np.float32), values)).clip(0, 1)), np.uint8
@@ -55,22 +53,18 @@ def gloss_picture(values: Float32Array, mask: Bools) -> Picture:
     metallic_roughness=gloss_picture,
 )
 def material(source: CaptureSource, estimate: NormalEstimate, progress: Progress) -> Float32Array:
-    """Return base colour, roughness, metalness, specular reflection and confidence, (H, W, 7), zero
-    outside the mask.
+    """Return the material (H, W, 7) of a capture, zero outside the mask.
+
+    The channels are base colour, roughness, metalness, specular reflection and confidence.
 
     Raises InputError if an image can no longer be read, or there are too few lights.
     """
     normals = take_pixels(estimate.normal_map, estimate.capture.mask)
     found = material_of(estimate, colours_of_surface(source, estimate.capture, normals, progress))
     maps = np.zeros((*estimate.capture.mask.shape, 7), np.float32)
-    columns = (
-        found.base_colour,
-        found.roughness,
-        found.metalness,
-        found.specular,
-        found.confidence,
+    maps[estimate.capture.mask] = np.column_stack(
+        (found.base_colour, found.roughness, found.metalness, found.specular, found.confidence)
     )
-    maps[estimate.capture.mask] = np.column_stack(columns)
     return maps
 
 
@@ -111,19 +105,22 @@ def material_warnings(facts: MaterialFacts) -> list[CaptureWarning]:
     """Return what the images do not determine about a material."""
     warnings = []
     if facts.gray:
-        text = "The images are gray, so base_colour shows brightness alone."
-        warnings.append(CaptureWarning(GRAY_MATERIAL, text))
-    if facts.determined < _LEAST_DETERMINED:
-        text = (
-            f"The images do not determine the roughness: {facts.determined:.1%} of the pixels have"
-            " a confidence of"
-            f" {_CONFIDENT} or more. Highlights are too few, or the normals too uncertain."
-            " roughness.npy has the most"
-            f" likely values, {facts.median_roughness:.2f} in the median. Add lights, some near"
-            " the camera"
-            " axis."
+        warnings.append(
+            CaptureWarning(
+                GRAY_MATERIAL, "The images are gray, so base_colour shows brightness alone."
+            )
         )
-        warnings.append(CaptureWarning(ROUGHNESS_UNDETERMINED, text))
+    if facts.determined < _LEAST_DETERMINED:
+        warnings.append(
+            CaptureWarning(
+                ROUGHNESS_UNDETERMINED,
+                f"The images do not determine the roughness: {facts.determined:.1%} of the pixels"
+                f" have a confidence of {_CONFIDENT} or more. Highlights are too few, or the"
+                " normals too uncertain. roughness.npy has the most likely values,"
+                f" {facts.median_roughness:.2f} in the median. Add lights, some near the camera"
+                " axis.",
+            )
+        )
     return warnings
 
 
@@ -134,8 +131,7 @@ PAGE_CAPTIONS = {
 
 
 def page_pictures(material: Float32Array) -> dict[str, Picture]:
-    """Return the pictures from which the page draws a material (H, W, 7), by their names in
-    PAGE_CAPTIONS.
+    """Return the pictures, named in PAGE_CAPTIONS, from which the page draws a material (H, W, 7).
 
     The base colour and the reflectance, usually 4 %, are encoded in sRGB, roughness and metalness
     are linear.

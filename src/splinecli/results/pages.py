@@ -1,32 +1,24 @@
-"""HTML pages of results: one with interactive relighting for each capture, and their overview,
-index.html.
-"""
+"""HTML pages of results: one for each capture, with relighting, and their index.html."""
 
 from __future__ import annotations
 
 import base64
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli._version import __version__
 from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.images import decode_image, image_bytes
 from splinecli.errors import InputError, OutputError
+from splinecli.maths import Bools, Float32Array, Picture
 from splinecli.maths.normals import unit
-from splinecli.pictures.maps import (
-    PREVIEW_LIGHT,
-    TICKS,
-    TOP_DEG,
-    Picture,
-    colour_errors,
-    encode_png,
-)
+from splinecli.pictures.maps import PREVIEW_LIGHT, TICKS, TOP_DEG, colour_errors, encode_png
 from splinecli.records.output_files import MAPS, NORMALS, PAGE, REPORT
 from splinecli.results.files import read_report
 from splinecli.results.maps import map_picture
@@ -40,8 +32,9 @@ def picture_url(file: bytes, kind: str = "png") -> str:
 
 
 def render(template: str, **values: object) -> str:
-    """Return the page rendered from a template and its values. Values are escaped; a missing value
-    is an error.
+    """Return the page rendered from a template and its values.
+
+    Values are escaped; a missing value is an error.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -66,12 +59,12 @@ _TIMES = "\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}"
 
 def result_page(
     report: Mapping[str, Any],
-    normal_map: NDArray[np.float32],
-    mask: NDArray[np.bool_],
+    normal_map: Float32Array,
+    mask: Bools,
     *,
-    values: Mapping[str, NDArray[np.float32]] | None = None,
-    material: NDArray[np.float32] | None = None,
-    error_map_deg: NDArray[np.float32] | None = None,
+    values: Mapping[str, Float32Array] | None = None,
+    material: Float32Array | None = None,
+    error_map_deg: Float32Array | None = None,
     light_plot: bytes | None = None,
 ) -> str:
     """Return one HTML file that contains everything it shows and loads nothing from a network.
@@ -99,9 +92,8 @@ def result_page(
     maps = dict(zip(("high", "low"), split_normals(unit(normals), shown), strict=True))
     error_png, exposure, captions = None, 0.0, {name: MAPS[name].caption for name in values}
     for name, whole in values.items():
-        reduced = _reduce(np.atleast_3d(whole), mask, LARGEST_MAP)[0].reshape(
-            *shown.shape, *whole.shape[2:]
-        )
+        reduced, _ = _reduce(np.atleast_3d(whole), mask, LARGEST_MAP)
+        reduced = reduced.reshape(*shown.shape, *whole.shape[2:])
         maps[name] = map_picture(MAPS[name], reduced, shown)
     if material is not None:
         maps |= page_pictures(_reduce(material, mask, LARGEST_MAP)[0])
@@ -109,9 +101,8 @@ def result_page(
         bright = float(np.quantile(material[mask][:, :3].max(axis=1), 0.99))  # is shown as white
         exposure = round(float(-np.log2(np.clip(bright, 1 / 16, 16))), 1)
     if error_map_deg is not None:
-        values_deg, known = _reduce(
-            error_map_deg[..., None], np.isfinite(error_map_deg), LARGEST_MAP
-        )
+        known = np.isfinite(error_map_deg)
+        values_deg, known = _reduce(error_map_deg[..., None], known, LARGEST_MAP)
         error_png = _data_url(colour_errors(np.where(known, values_deg[..., 0], np.nan)))
     first = _first_pictures(maps, normals, shown) if shown.size > 500_000 else {}
     (height, width), size = shown.shape, _size(shown)
@@ -129,9 +120,8 @@ def result_page(
         title=report["capture"],
         report=report,
         facts=_facts(report, size if is_reduced else None),
-        reduced=(
-            f"This page shows {size} of the {_size(mask)} pixels. The other files have all pixels."
-        )
+        reduced=f"This page shows {size} of the {_size(mask)} pixels. The other files have all"
+        " pixels."
         if is_reduced
         else None,
         unit="pixels" if millimetres is None else "mm",
@@ -153,23 +143,24 @@ def result_page(
     )
 
 
-def split_normals(normals: NDArray[np.float32], mask: NDArray[np.bool_]) -> tuple[Picture, Picture]:
-    """Return unit normals (H, W, 3) as two RGB pictures: the upper 8 bits of (n + 1) / 2, and the
-    LOW_BITS below.
+def split_normals(normals: Float32Array, mask: Bools) -> tuple[Picture, Picture]:
+    """Return unit normals (H, W, 3) as two RGB pictures, of upper and lower bits.
 
-    The first is the usual picture of a normal map. Both are black outside the mask (H, W). A pixel
-    that is black in the first picture must be outside, because no unit normal is near (-1, -1, -1).
-    The pictures have no alpha channel, because a browser would multiply the colours by it.
+    They are the upper 8 bits of (n + 1) / 2, and the LOW_BITS below. The first is the usual picture
+    of a normal map. Both are black outside the mask (H, W). A pixel that is black in the first
+    picture must be outside, because no unit normal is near (-1, -1, -1). The pictures have no alpha
+    channel, because a browser would multiply the colours by it.
     """
     codes = np.rint((normals + 1) / 2 * _LARGEST_CODE).astype(np.uint16) * mask[..., None]
     return (codes >> LOW_BITS).astype(np.uint8), (codes & (2**LOW_BITS - 1)).astype(np.uint8)
 
 
 def _first_pictures(
-    maps: Mapping[str, Picture], normals: NDArray[np.float32], mask: NDArray[np.bool_]
+    maps: Mapping[str, Picture], normals: Float32Array, mask: Bools
 ) -> dict[str, Picture]:
-    """Return pictures of at most 100,000 pixels of the maps, which a browser shows while it loads
-    the others.
+    """Return small pictures of the maps, which a browser shows while it loads the others.
+
+    They have at most 100,000 pixels.
     """
     import cv2
 
@@ -181,13 +172,11 @@ def _first_pictures(
     return first
 
 
-def _reduce(
-    values: NDArray[np.float32], known: NDArray[np.bool_], largest: int
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return values (H, W, C) and their mask, reduced to at most `largest` pixels and sides of at
-    most LONGEST_SIDE.
+def _reduce(values: Float32Array, known: Bools, largest: int) -> tuple[Float32Array, Bools]:
+    """Return values (H, W, C) and their mask, reduced in size.
 
-    A reduced value is the mean of the known values in its area, and is known if one of them is.
+    The result has at most `largest` pixels, and sides of at most LONGEST_SIDE. A reduced value is
+    the mean of the known values in its area, and is known if one of them is.
     """
     import cv2
 
@@ -199,40 +188,39 @@ def _reduce(
     weight = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)[..., None]
     # OpenCV takes up to four
     channels = (np.where(known, channel, 0) for channel in np.moveaxis(values, 2, 0))
-    total = np.dstack(
-        [cv2.resize(channel, size, interpolation=cv2.INTER_AREA) for channel in channels]
-    )
+    total = np.dstack([cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in channels])
     return np.divide(total, weight, out=np.zeros_like(total), where=weight > 0), weight[..., 0] > 0
 
 
-def _size(mask: NDArray[np.bool_]) -> str:
+def _size(mask: Bools) -> str:
     height, width = mask.shape
     return f"{width}{_TIMES}{height}"
 
 
 def _facts(report: Mapping[str, Any], reduced: str | None) -> list[tuple[str, str]]:
-    """Return pairs of terms and values; `reduced` is the size of the page's maps if they were
-    reduced.
+    """Return pairs of terms and values.
+
+    `reduced` is the size of the maps on the page if they were reduced.
     """
     weights, expected = report["weights"], report["expected_under_5"]
     # up to this page
     stages = [(name, n) for name, n in report["seconds"].items() if n >= 0.05 and name != "total"]
     condition = "" if report["capture_judged"] else ", if the lights and the images are right"
-    return [
+    facts = [
         ("Method", report["method"]),
-        *([] if weights is None else [("Weights", weights["name"])]),
+        ("Weights", weights and weights["name"]),
         ("Lights", str(report["n_lights"])),
         ("Pixels", f"{report['n_pixels']:,}"),
         ("Size", _TIMES.join(map(str, report["image_size"]))),
-        *(
-            []
-            if expected is None
-            else [("Likely within 5°", f"{expected:.0%} of the pixels{condition}")]
+        (
+            "Likely within 5°",
+            None if expected is None else f"{expected:.0%} of the pixels{condition}",
         ),
-        *([] if reduced is None else [("Size on this page", reduced)]),
+        ("Size on this page", reduced),
         ("Seconds", ", ".join(f"{name.replace('_', ' ')} {n:.1f}" for name, n in stages)),
         ("Device", f"{report['device']}, {report['precision']}"),
     ]
+    return [(term, value) for term, value in facts if value is not None]
 
 
 def _data_url(picture: Picture) -> str:
@@ -242,7 +230,7 @@ def _data_url(picture: Picture) -> str:
 INDEX = "index.html"
 
 
-class Row(NamedTuple):
+class IndexRow(NamedTuple):
     """One row of the overview, as text. A capture that failed has only its name and the error."""
 
     capture: str
@@ -255,73 +243,58 @@ class Row(NamedTuple):
     error: str = ""
 
 
-HEADER = Row(
+HEADER = IndexRow(
     "capture", "lights", "pixels", "MAE", "likely within 5°", "warnings", "seconds", "error"
 )
 
 
-class Entry(NamedTuple):
+class IndexEntry(NamedTuple):
     """The page's entry for one capture: its row, the names of its files, and its warnings."""
 
-    row: Row
+    row: IndexRow
     files: tuple[str, ...] = ()
     words: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, report: Mapping[str, Any]) -> Entry:
-        """Return the entry for a report (see report_of), or for a document with `capture` and
-        `error`.
-        """
+    def of(cls, report: Mapping[str, Any]) -> IndexEntry:
+        """Return the entry for a report, or for a document with `capture` and `error`."""
         if "error" in report:
-            return cls(Row(report["capture"], error=report["error"]))
-        errors, expected, seconds = (
-            report["angular_error_deg"],
-            report["expected_under_5"],
-            report["seconds"],
-        )
-        row = Row(
+            return cls(IndexRow(report["capture"], error=report["error"]))
+        errors, expected = report["angular_error_deg"], report["expected_under_5"]
+        seconds, warnings = report["seconds"], report["warnings"]
+        row = IndexRow(
             report["capture"],
             lights=str(report["n_lights"]),
             pixels=f"{report['n_pixels']:,}",
             mae="" if errors is None else f"{errors['mean']:.2f}°",
             likely="" if expected is None else f"{expected:.0%}",
-            warnings=str(len(report["warnings"]) or ""),
+            warnings=str(len(warnings) or ""),
             seconds=f"{seconds.get('total', sum(seconds.values())):.1f}",
         )
-        return cls(
-            row,
-            tuple(report["files"]),
-            tuple(str(warning["text"]) for warning in report["warnings"]),
-        )
+        words = tuple(str(warning["text"]) for warning in warnings)
+        return cls(row, tuple(report["files"]), words)
 
 
-def index_page(entries: Sequence[Entry], output: Path) -> str:
-    """Return the overview page with small normal maps and links to the files, for the folder above
-    the captures.
-    """
+def index_page(entries: Sequence[IndexEntry], output: Path) -> str:
+    """Return the overview page of the folder above the captures, with thumbnails and links."""
     rows = []
     for row, files, words in entries:
         # Quote the bytes, because a folder's name may not be valid text.
         folder = quote(os.fsencode(row.capture))
         picture = next((name for name in (NORMALS["png8"], NORMALS["png"]) if name in files), None)
-        rows.append(
-            {
-                **row._asdict(),
-                "page": f"{folder}/{PAGE}" if PAGE in files else None,
-                "picture": None if picture is None else f"{folder}/{picture}",
-                "thumbnail": None
-                if picture is None
-                else _thumbnail(output / row.capture / picture),
-                "words": words,
-                "files": [(name, f"{folder}/{quote(name)}") for name in files],
-            }
-        )
+        shown = {**row._asdict(), "words": words, "page": None, "picture": None, "thumbnail": None}
+        shown["files"] = [(name, f"{folder}/{quote(name)}") for name in files]
+        if PAGE in files:
+            shown["page"] = f"{folder}/{PAGE}"
+        if picture is not None:
+            shown["picture"] = f"{folder}/{picture}"
+            shown["thumbnail"] = _thumbnail(output / row.capture / picture)
+        rows.append(shown)
     return render("index.html", title=f"{len(entries)} captures", header=HEADER, rows=rows)
 
 
 def _thumbnail(path: Path) -> str | None:
-    """Return a picture of at most 256 x 192 pixels as a JPEG data URL, or None if it cannot be
-    read.
+    """Return a picture of at most 256 x 192 pixels as a JPEG data URL, or None if unreadable.
 
     This is twice its size on the page, for sharp screens.
     """
@@ -344,9 +317,10 @@ def _thumbnail(path: Path) -> str | None:
     return picture_url(jpeg.tobytes(), "jpeg") if done else None
 
 
-def with_earlier(entries: Sequence[Entry], folder: Path) -> list[Entry]:
-    """Return the entries, followed by entries for other captures with results in the folder, sorted
-    by name.
+def with_earlier(entries: Sequence[IndexEntry], folder: Path) -> list[IndexEntry]:
+    """Return the entries, followed by those of other captures with results in the folder.
+
+    The others are sorted by name.
     """
     names = {entry.row.capture for entry in entries}
     earlier = []
@@ -354,7 +328,7 @@ def with_earlier(entries: Sequence[Entry], folder: Path) -> list[Entry]:
         if path.parent.name in names or path.parent.is_symlink():
             continue
         try:
-            entry = Entry.of(read_report(path.parent))
+            entry = IndexEntry.of(read_report(path.parent))
         except Exception as error:  # a report from elsewhere may be invalid in any way
             if is_out_of_memory(error):
                 raise
@@ -366,19 +340,18 @@ def with_earlier(entries: Sequence[Entry], folder: Path) -> list[Entry]:
 
 def has_index(folder: Path) -> bool:
     """Return whether the folder has an index.html that splinecli wrote."""
-    try:
-        if not (folder / INDEX).is_file():
-            return False
-        with (folder / INDEX).open("rb") as file:
-            # it is near the top
-            return b'<meta name="generator" content="splinecli">' in file.read(1 << 16)
-    except OSError:
-        return False
+    with suppress(OSError):
+        if (folder / INDEX).is_file():
+            with (folder / INDEX).open("rb") as file:
+                # it is near the top
+                return b'<meta name="generator" content="splinecli">' in file.read(1 << 16)
+    return False
 
 
 def check_index_free(folder: Path, *, overwrite: bool) -> None:
-    """Raise OutputError if the folder has an index.html that splinecli did not write and may not
-    replace.
+    """Raise OutputError if the folder has an index.html that may not be replaced.
+
+    That is one which splinecli did not write.
     """
     path = folder / INDEX
     if path.is_dir() or (path.exists() and not overwrite and not has_index(folder)):

@@ -37,7 +37,7 @@ from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.maths.normals import unit
 from splinecli.maths.pixel_grid import focal_length, pixel_rays, ray_basis
 
-Pixels = NDArray[np.int32]
+PixelNumbers = NDArray[np.int32]
 DISCONTINUITY = 2.0  # how easily the surface tears, as in the paper
 # residual that contradicts a normal, such as a frontal one with an error of 17 degrees
 CONTRADICTION = 0.3
@@ -57,7 +57,7 @@ class BilateralEquations:
     slants: tuple[Float64Array, Float64Array]
     # the pairs of neighbours along the rows, and those along the columns. Each is (E,) pixel
     # numbers on the left or above, and (E,) pixel numbers on the right or below.
-    pairs: tuple[tuple[Pixels, Pixels], tuple[Pixels, Pixels]]
+    pairs: tuple[tuple[PixelNumbers, PixelNumbers], tuple[PixelNumbers, PixelNumbers]]
 
     @classmethod
     def from_normals(
@@ -97,11 +97,7 @@ class BilateralEquations:
         weights, flows = [], []
         for slant, (near, far) in zip(self.slants, self.pairs, strict=True):
             gap = heights[far] - heights[near]
-            ahead, behind, largest = (
-                np.zeros_like(heights),
-                np.zeros_like(heights),
-                np.zeros_like(heights),
-            )
+            ahead, behind, largest = np.zeros((3, len(heights)))
             ahead[near], behind[far] = gap, gap
             # Both pixels of a pair have an equation for its gap.
             residuals = [self.facing[pixels] * gap + slant[pixels] for pixels in (near, far)]
@@ -109,7 +105,7 @@ class BilateralEquations:
                 largest[pixels] = np.maximum(largest[pixels], np.abs(residual))
             share_ahead = expit(discontinuity * self.facing**2 * (behind**2 - ahead**2))
             share_ahead = 0.5 - (share_ahead - 0.5) * np.expm1(-((largest / CONTRADICTION) ** 2))
-            weight, flow = np.zeros_like(gap), np.zeros_like(gap)
+            weight, flow = np.zeros((2, len(gap)))
             shares = share_ahead[near], 1 - share_ahead[far]
             for pixels, share, residual in zip((near, far), shares, residuals, strict=True):
                 weight += share * self.facing[pixels] ** 2
@@ -120,15 +116,14 @@ class BilateralEquations:
 
 
 class LaplacianSolver:
-    """Solve the normal equations of pairs of neighbours again and again, with other weights each
-    time.
+    """Solve the normal equations of pairs of neighbours repeatedly, with changing weights.
 
     The matrix is a weighted Laplacian of the graph of pixels. The solver has conjugate gradients
     with an algebraic multigrid preconditioner. Its setup costs as much as several solves, so it is
     kept while the weights stay similar.
     """
 
-    def __init__(self, pairs: tuple[tuple[Pixels, Pixels], ...], n_pixels: int) -> None:
+    def __init__(self, pairs: tuple[tuple[PixelNumbers, PixelNumbers], ...], n_pixels: int) -> None:
         from scipy.sparse import csr_matrix
 
         self._near = np.concatenate([near for near, _ in pairs])
@@ -152,12 +147,12 @@ class LaplacianSolver:
         pull: Float64Array | float = 0.0,
         distance: Float64Array | float = 0.0,
     ) -> Float64Array:
-        """Return the change of heights (P,) that minimises the sum of squares, to a relative
-        residual of `precision`.
+        """Return the change of heights (P,) that minimises the sum of squares.
 
-        Weights (E,) are half the second derivative by the gap of each pair, flows (E,) half the
-        first. `pull` (P,) is half the second derivative by the height of each pixel, of the cost
-        that pulls it to a known height, and `distance` (P,) has the heights above these known ones.
+        The solution is accurate to a relative residual of `precision`. Weights (E,) are half the
+        second derivative by the gap of each pair, flows (E,) half the first. `pull` (P,) is half
+        the second derivative by the height of each pixel, of the cost that pulls it to a known
+        height, and `distance` (P,) has the heights above these known ones.
         """
         from pyamg import ruge_stuben_solver
         from scipy.sparse import csr_matrix
@@ -186,11 +181,9 @@ class LaplacianSolver:
             M=self._preconditioner,
             callback=lambda _: next(steps),
         )
-        if (
-            next(steps) > 15
-        ):  # above this number of steps, a new preconditioner saves more time than it costs
+        if next(steps) > 15:  # then a new preconditioner saves more time than it costs
             self._preconditioner = None
         return change
 
-    def _sum(self, of_pairs: Float64Array, pixels: Pixels) -> Float64Array:
+    def _sum(self, of_pairs: Float64Array, pixels: PixelNumbers) -> Float64Array:
         return np.asarray(np.bincount(pixels, of_pairs, self._n_pixels), np.float64)

@@ -10,8 +10,7 @@ right, y up, z to the camera (docs/files-and-frames.md).
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from math import isfinite
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +25,7 @@ from splinecli.surface.bilateral_equations import (
     BilateralEquations,
     LaplacianSolver,
 )
+from splinecli.system.progress import Progress, ignore
 
 _LATER_PRECISION = 0.03  # relative residual of the linear solves but the first
 _STILL = 0.002  # pixels: the rms movement at which the surface is finished
@@ -34,8 +34,6 @@ _SOLVES_OF_COARSEST = 150
 # of a prior in pixels or millimetres; above it, float32 only represents whole numbers
 _LARGEST_VALUE = 1e7
 RELIEF_WIDTH = 64.0  # pixels: the wavelength at which the high-pass filter halves the amplitude
-
-Progress = Callable[[float], object]  # called with the share of the work that was just done
 
 
 def integrate_normals(
@@ -46,10 +44,11 @@ def integrate_normals(
     discontinuity: float = DISCONTINUITY,
     prior: Floats | None = None,
     prior_detail: float | None = None,
-    progress: Progress = lambda share: None,
+    progress: Progress = ignore,
 ) -> Float64Array:
-    """Integrate a normal map (H, W, 3) to a height or depth map (H, W), float64, NaN outside the
-    mask.
+    """Integrate a normal map (H, W, 3) into a height or depth map (H, W).
+
+    The result is float64, NaN outside the mask.
 
     For an orthographic camera, the result is the height towards the camera in pixels. With a camera
     matrix, it is the positive depth along the viewing axis, of unknown scale. Normals do not fix
@@ -69,7 +68,7 @@ def integrate_normals(
             offset and, for depths, its scale.
         prior_detail: the wavelength in pixels at which prior and normals have equal weight. Longer
             waves follow the prior. None for 15 % of the root of the mask's area.
-        progress: see Progress. The shares may add up to less than 1.
+        progress: receives shares of the work, which may add up to less than 1.
 
     Raises:
         UsageError: the shapes or types of the arrays do not fit, or an option is out of range.
@@ -77,7 +76,7 @@ def integrate_normals(
             is not valid, or the prior has no value in the mask, or clearly another direction or
             unit.
     """
-    if not (isfinite(discontinuity) and discontinuity >= 0):
+    if not 0 <= discontinuity < inf:
         raise UsageError(f"the discontinuity is {discontinuity:g}, expected a number of at least 0")
     if mask is None:
         if normal_map.ndim != 3 or normal_map.shape[2] != 3:
@@ -89,13 +88,11 @@ def integrate_normals(
     known = None
     if prior is not None:
         known = _heights_of_prior(prior, mask, camera_matrix)
-        prior_detail = (
-            0.15 * float(np.sqrt(np.count_nonzero(mask))) if prior_detail is None else prior_detail
-        )
-        if not (isfinite(prior_detail) and prior_detail > 0):
-            raise UsageError(
-                f"the detail of the prior is {prior_detail:g} pixels, expected a positive number"
-            )
+        if prior_detail is None:
+            prior_detail = 0.15 * float(np.sqrt(np.count_nonzero(mask)))
+        if not 0 < prior_detail < inf:
+            problem = f"the detail of the prior is {prior_detail:g} pixels"
+            raise UsageError(f"{problem}, expected a positive number")
     surface = _Surface(normal_map, mask, camera_matrix, known, prior_detail or 0.0)
     if known is not None:
         _check_prior(surface)
@@ -111,10 +108,9 @@ def relief_of_normals(normal_map: Float32Array, mask: Bools) -> Float32Array:
     if the mask is empty.
     """
     flat = np.zeros(mask.shape)
-    relief = integrate_normals(
+    return integrate_normals(
         normal_map, mask, discontinuity=0, prior=flat, prior_detail=RELIEF_WIDTH
-    )
-    return relief.astype(np.float32)
+    ).astype(np.float32)
 
 
 class _Surface(NamedTuple):
@@ -152,7 +148,7 @@ def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> F
     normal_map, mask, camera_matrix, prior, prior_detail = surface
     equations = BilateralEquations.from_normals(normal_map, mask, camera_matrix)
     n_pixels = len(equations.facing)
-    heights: Float64Array = np.zeros(n_pixels)
+    heights = np.zeros(n_pixels)
     # At heights of zero all weights are equal, so the first solve is least squares and needs full
     # precision. Each later solve moves the surface a little further, for which few digits suffice.
     precision, most, own_share = 1e-9, _SOLVES_OF_COARSEST if discontinuity > 0 else 1, 1.0
@@ -189,11 +185,11 @@ def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> F
 def _normals_of(
     blocks: Blocks, normals: Float64Array, mask: Bools, *, keep_edges: bool
 ) -> Float64Array:
-    """Return the normals (p, 3) of blocks from their pixels' normals (P, 3): of the mean slope, or
-    the steepest one.
+    """Return the normals (p, 3) of blocks from those of their pixels (P, 3).
 
-    With keep_edges, a block that contains an edge has the steepest normal, which belongs to the
-    rim. The mean over an edge would be a slope that joins the two separate sides.
+    They are the normals of the mean slope, or the steepest ones. With keep_edges, a block that
+    contains an edge has the steepest normal, which belongs to the rim. The mean over an edge would
+    be a slope that joins the two separate sides.
     """
     slopes = normals / np.maximum(normals[:, 2:], SMALLEST_COSINE)
     mean = unit(blocks.average(slopes, mask))
@@ -211,23 +207,16 @@ def _normals_of(
 
 
 def _heights_of_prior(prior: Floats, mask: Bools, camera_matrix: Floats | None) -> Float64Array:
-    """Return the heights (P,) of a prior in the unit of the equations,
-    NaN where it is not known.
-    """
+    """Return a prior as heights (P,) in the unit of the equations, NaN where unknown."""
     if prior.shape != mask.shape:
-        raise UsageError(
-            f"the prior has shape {prior.shape}, expected {mask.shape} as in the normal map"
-        )
+        expected = f"expected {mask.shape} as in the normal map"
+        raise UsageError(f"the prior has shape {prior.shape}, {expected}")
     heights = prior[mask].astype(np.float64)
-    _refuse(
-        np.isfinite(heights) & (np.abs(heights) > _LARGEST_VALUE),
-        mask,
-        f"beyond {_LARGEST_VALUE:g}",
-    )
+    beyond = np.isfinite(heights) & (np.abs(heights) > _LARGEST_VALUE)
+    _refuse(beyond, mask, f"beyond {_LARGEST_VALUE:g}")
     if camera_matrix is not None:
-        _refuse(
-            (heights > 0) & (heights < 1 / _LARGEST_VALUE), mask, f"below {1 / _LARGEST_VALUE:g}"
-        )
+        smallest = 1 / _LARGEST_VALUE
+        _refuse((heights > 0) & (heights < smallest), mask, f"below {smallest:g}")
         heights = -focal_length(camera_matrix) * np.log(np.where(heights > 0, heights, np.nan))
     heights[~np.isfinite(heights)] = np.nan
     if np.isnan(heights).all():
@@ -236,23 +225,18 @@ def _heights_of_prior(prior: Floats, mask: Bools, camera_matrix: Floats | None) 
 
 
 def _refuse(wrong: Bools, mask: Bools, what: str) -> None:
-    """Raise InputError if any values (P,) of a prior over a mask (H, W) are wrong, with the reason
-    in the message.
-    """
+    """Raise InputError if any value (P,) of a prior over a mask (H, W) is wrong: `what`."""
     if wrong.any():
-        row, column = divmod(int(np.flatnonzero(mask)[wrong.argmax()]), mask.shape[1])
-        problem = (
-            f"{np.count_nonzero(wrong)} of {wrong.size} values of the prior are {what}, the first"
-            f" in row {row}"
+        row, column = np.argwhere(mask)[wrong.argmax()]
+        problem = f"{np.count_nonzero(wrong)} of {wrong.size} values of the prior are {what}"
+        raise InputError(
+            f"{problem}, the first in row {row}, column {column}",
+            hint="Give them in the unit of the result, and NaN where nothing is known",
         )
-        hint = "Give them in the unit of the result, and NaN where nothing is known"
-        raise InputError(f"{problem}, column {column}", hint=hint)
 
 
 def _check_prior(surface: _Surface) -> None:
-    """Raise InputError for a prior that is negated, in another unit than the normals, or has values
-    far from others.
-    """
+    """Raise InputError for a prior that is negated, in another unit, or has outliers."""
     step = max(1, round(min(surface.prior_detail, *surface.mask.shape) / 4))
     coarse = surface.of_blocks(Blocks.of_step(surface.mask, step), keep_edges=False)
     equations = BilateralEquations.from_normals(
@@ -271,12 +255,11 @@ def _check_prior(surface: _Surface) -> None:
     steeper = both / max(float(wanted @ wanted), 1e-12)
     # A blurred prior is flatter than the normals.
     if abs(correlation) > 0.3 and not 0.2 < steeper < 5.0:  # slopes of prior and normals
-        problem = f"the prior is {steeper:.2g} times as steep as the normals, expected about 1"
-        hint = (
-            "Give heights towards the camera, or depths with a camera matrix, in the unit of the"
-            " result"
+        hint = "Give heights towards the camera, or depths with a camera matrix, in the unit of the"
+        raise InputError(
+            f"the prior is {steeper:.2g} times as steep as the normals, expected about 1",
+            hint=f"{hint} result",
         )
-        raise InputError(problem, hint=hint)
     assert surface.prior is not None
     farthest = 3.0 * max(np.ptp(np.flatnonzero(surface.mask.any(axis=axis))) + 1 for axis in (0, 1))
     away = np.abs(surface.prior - np.nanmedian(surface.prior)) > farthest
@@ -290,16 +273,15 @@ def _depth_map(
 
     parts = label(mask)[0][mask] - 1  # label joins pixels that share a side, as the equations do
     offsets = np.bincount(parts, heights) / np.bincount(parts)
-    if (
-        prior is not None
-    ):  # a part that the prior does not cover has the mean height of the known pixels
+    if prior is not None:
+        # A part that the prior does not cover has the mean height of the known pixels.
         is_known = np.bincount(parts, np.isfinite(prior)) > 0
         offsets = np.where(is_known, 0, offsets - np.nanmean(prior))
     heights = heights - offsets[parts]
     depth = np.full(mask.shape, np.nan)
-    depth[mask] = (
-        heights if camera_matrix is None else np.exp(-heights / focal_length(camera_matrix))
-    )
+    if camera_matrix is not None:
+        heights = np.exp(-heights / focal_length(camera_matrix))
+    depth[mask] = heights
     return depth
 
 
@@ -307,10 +289,8 @@ def _check_maps(normal_map: Floats, mask: Bools) -> None:
     if mask.ndim != 2 or mask.dtype != np.bool_:
         raise UsageError(f"the mask is {mask.dtype} {mask.shape}, expected bool (H, W)")
     if normal_map.shape != (*mask.shape, 3):
-        raise UsageError(
-            f"the normal map has shape {normal_map.shape}, expected {(*mask.shape, 3)} for this"
-            " mask"
-        )
+        expected = f"expected {(*mask.shape, 3)} for this mask"
+        raise UsageError(f"the normal map has shape {normal_map.shape}, {expected}")
     if not mask.any():
         raise InputError("the mask is empty", hint="Mark the pixels of the object in it")
     wrong = mask.copy()
@@ -320,9 +300,7 @@ def _check_maps(normal_map: Floats, mask: Bools) -> None:
     wrong[mask] = ~(np.abs(length - 1) <= 1e-2)
     if wrong.any():
         row, column = np.argwhere(wrong)[0]
-        problem = (
-            f"{np.count_nonzero(wrong)} of {length.size} normals in the mask are not unit vectors,"
-            " the first in"
-        )
+        problem = f"{np.count_nonzero(wrong)} of {length.size} normals in the mask are not unit"
         hint = "Leave pixels without a normal out of the mask"
-        raise InputError(f"{problem} row {row}, column {column}", hint=hint)
+        first = f"the first in row {row}, column {column}"
+        raise InputError(f"{problem} vectors, {first}", hint=hint)

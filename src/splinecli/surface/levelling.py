@@ -1,6 +1,4 @@
-"""Level a surface: remove the slope of its main plane, or of a plane through points, from heights
-and normals.
-"""
+"""Level a surface: remove the slope of its main plane, or of a plane through points."""
 
 from __future__ import annotations
 
@@ -20,8 +18,9 @@ _AROUND = 2  # pixels around a given point whose median height is taken
 def plane_slopes(
     heights: Floats, points: Sequence[tuple[int, int]] = (), *, aspect: float = 1.0
 ) -> tuple[float, float]:
-    """Return the slopes (dz/dx, dz/dy) of a plane in a height map (H, W), NaN outside the object; y
-    is up.
+    """Return the slopes (dz/dx, dz/dy) of a plane in a height map (H, W), y up.
+
+    The map is NaN outside the object.
 
     Args:
         points: columns and rows of at least three points on the plane, or () for the dominant plane
@@ -34,42 +33,38 @@ def plane_slopes(
     if points:
         values = []
         for x, y in points:
-            around = heights[
-                max(0, y - _AROUND) : y + _AROUND + 1, max(0, x - _AROUND) : x + _AROUND + 1
-            ]
-            if not (0 <= y < heights.shape[0] and 0 <= x < heights.shape[1]) or not np.isfinite(
-                heights[y, x]
-            ):
+            inside = 0 <= y < heights.shape[0] and 0 <= x < heights.shape[1]
+            if not inside or not np.isfinite(heights[y, x]):
                 raise UsageError(f"the point {x},{y} of --level is not on the object")
-            values.append(float(np.nanmedian(around)))
+            window = tuple(slice(max(0, at - _AROUND), at + _AROUND + 1) for at in (y, x))
+            values.append(float(np.nanmedian(heights[window])))
         columns, rows = np.array(points, np.float64).T
         z = np.array(values)
     else:
         rows, columns = np.nonzero(np.isfinite(heights))
         z = heights[rows, columns].astype(np.float64)
-    terms = np.stack(
-        (columns - columns.mean(), (rows.mean() - rows) * aspect, np.ones(len(z))), axis=1
-    )
+    x, y = columns - columns.mean(), (rows.mean() - rows) * aspect
+    terms = np.stack((x, y, np.ones(len(z))), axis=1)
     sizes = np.linalg.svd(terms[:, :2], compute_uv=False)
     if sizes[-1] < 1e-2 * sizes[0]:
         raise UsageError(
             "the points of --level are in a line", hint="Choose points that span a plane"
         )
-    weights, right, up = np.ones(len(z)), 0.0, 0.0
+    weights, plane = np.ones(len(z)), np.zeros(3)
     for _ in range(1 if points else _FITS):
         weighted = terms * weights[:, None]
-        matrix, sides = weighted.T @ terms, weighted.T @ z
-        right, up, offset = (float(value) for value in np.linalg.inv(matrix) @ sides)
-        left = np.abs(z - terms @ np.array((right, up, offset)))
+        plane = np.linalg.inv(weighted.T @ terms) @ (weighted.T @ z)
+        left = np.abs(z - terms @ plane)
         weights = 1 / (1 + (left / max(_CUT * 1.4826 * float(np.median(left)), 1e-9)) ** 2)
-    return right, up
+    return float(plane[0]), float(plane[1])
 
 
 def level_heights(
     heights: Floats, slopes: tuple[float, float], *, aspect: float = 1.0
 ) -> Float64Array:
-    """Return heights (H, W) minus a plane with these slopes that has the mean height 0 on the
-    object.
+    """Subtract a plane with these slopes from heights (H, W).
+
+    The plane has the mean height 0 on the object.
     """
     rows, columns = np.indices(heights.shape)
     plane = np.asarray(slopes[0] * columns - slopes[1] * aspect * rows, np.float64)

@@ -1,5 +1,4 @@
-"""Triangle meshes of height and depth maps, and meshes of fewer triangles, whose normal texture
-keeps the detail.
+"""Triangle meshes of height and depth maps, also decimated with a texture of the normals.
 
 Frame: x right, y up, z to the camera (docs/files-and-frames.md). For an orthographic camera,
 coordinates are in pixels and the origin is the centre of the image. For a pinhole camera, they are
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Integers
+from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Indices, Integers, Picture
 from splinecli.maths.normals import unit
 from splinecli.maths.pixel_grid import Blocks, focal_length, image_points, pixel_rays, ray_basis
 from splinecli.system.machine import import_extra
@@ -38,19 +37,19 @@ class SurfaceMesh:
     # (V, 2) float32, the places of the vertices in the textures: u from 0 at the left to 1 at the
     # right, v from 0 at the top to 1 at the bottom, as in glTF
     uvs: Float32Array
-    texture: NDArray[np.uint8] | None = None  # (H, W, 3) uint8, sRGB colours, or None
+    texture: Picture | None = None  # (H, W, 3) uint8, sRGB colours, or None
     # (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None if
     # `normals` are exact.
-    normal_texture: NDArray[np.uint8] | None = None
+    normal_texture: Picture | None = None
     # (H, W, 3) uint8, linear, roughness in green and metalness in blue, as in glTF; or None for a
     # matte surface
-    gloss: NDArray[np.uint8] | None = None
+    gloss: Picture | None = None
     # (H, W) float32, 0.5 for a reflectance of 4 % at normal incidence; None for that everywhere
     specular: Float32Array | None = None
     tangents: Float32Array | None = None  # (V, 3) float32, unit; only with a normal texture
 
     @property
-    def colours(self) -> NDArray[np.uint8] | None:
+    def colours(self) -> Picture | None:
         """The colours of the vertices in the texture, (V, 3) uint8."""
         if self.texture is None:
             return None
@@ -59,28 +58,39 @@ class SurfaceMesh:
         return np.asarray(self.texture[rows.clip(0, height - 1), columns.clip(0, width - 1)])
 
 
+@dataclass(frozen=True)
+class Textures:
+    """Pictures for a mesh, each (H, W) or (H, W, 3); see the fields of SurfaceMesh."""
+
+    texture: Picture | None = None
+    gloss: Picture | None = None
+    specular: Float32Array | None = None
+
+    def put_on(self, mesh: SurfaceMesh, mask: Bools) -> SurfaceMesh:
+        """Return a mesh with these textures, which are known in the mask (H, W)."""
+        given = {name: picture for name, picture in vars(self).items() if picture is not None}
+        return replace(mesh, **{name: fill_outside(given[name], mask) for name in given})
+
+
 def surface_mesh(
     depth: Floats,
     mask: Bools,
     camera_matrix: Floats | None = None,
-    colours: NDArray[np.uint8] | None = None,
     *,
     normal_map: Floats | None = None,
     largest_step: float | None = None,
 ) -> SurfaceMesh:
-    """Return the mesh of a height or depth map, with a vertex for each pixel of the mask, row by
-    row.
+    """Return the mesh of a height or depth map, with a vertex for each pixel of the mask.
 
-    Four pixels of the mask in a square make two triangles, split along the diagonal whose ends
-    differ less in height. Three make one triangle. Raises UsageError if the largest step is
-    negative.
+    Vertices are in the order of the pixels, row by row. Four pixels of the mask in a square make
+    two triangles, split along the diagonal whose ends differ less in height. Three make one
+    triangle. Raises UsageError if the largest step is negative.
 
     Args:
         depth: (H, W), finite in the mask (H, W): heights, or positive depths with a camera matrix,
             as integrate_normals returns them.
         mask: (H, W), True on the object.
         camera_matrix: (3, 3), the one that integrate_normals had, or None.
-        colours: (H, W, 3) uint8 sRGB, or None.
         normal_map: (H, W, 3), unit in the mask: the normals of the vertices. None to compute them
             from the triangles.
         largest_step: leaves out triangles whose corners differ by more than this in height, in
@@ -89,11 +99,10 @@ def surface_mesh(
     """
     if largest_step is not None and not largest_step >= 0:
         raise UsageError(f"the largest step is {largest_step:g}, expected a number of at least 0")
-    values = depth[mask].astype(np.float64)
+    heights = values = depth[mask].astype(np.float64)
     if camera_matrix is None:
         rows, columns = np.nonzero(mask)
-        heights = values
-        last_row, last_column = mask.shape[0] - 1, mask.shape[1] - 1
+        last_row, last_column = np.array(mask.shape) - 1
         vertices = np.stack((columns - last_column / 2, last_row / 2 - rows, values), axis=1)
     else:
         vertices = values[:, None] * pixel_rays(mask, camera_matrix)
@@ -102,13 +111,8 @@ def surface_mesh(
     if largest_step is not None:
         triangles = triangles[np.ptp(heights[triangles], axis=1) <= largest_step]
     normals = vertex_normals(vertices, triangles) if normal_map is None else normal_map[mask]
-    return SurfaceMesh(
-        vertices.astype(np.float32),
-        triangles,
-        normals.astype(np.float32),
-        texture_coordinates(image_points(vertices, mask.shape, camera_matrix), mask.shape),
-        None if colours is None else fill_outside(colours, mask),
-    )
+    uvs = texture_coordinates(image_points(vertices, mask.shape, camera_matrix), mask.shape)
+    return SurfaceMesh(vertices.astype(np.float32), triangles, normals.astype(np.float32), uvs)
 
 
 def check_triangles(mask: Bools, path: Path) -> None:
@@ -147,15 +151,12 @@ def vertex_normals(vertices: Floats, triangles: Integers) -> Float64Array:
 
 
 def texture_coordinates(points: Floats, shape: tuple[int, ...]) -> Float32Array:
-    """Return the texture coordinates (V, 2) of image points (V, 2), column and row; see
-    SurfaceMesh.uvs.
-    """
+    """Return the texture coordinates (V, 2) of image points (V, 2); see SurfaceMesh.uvs."""
     return ((points + 0.5) / (shape[1], shape[0])).astype(np.float32)
 
 
 def fill_outside(texture: NDArray[Any], known: Bools) -> NDArray[Any]:
-    """Return a texture (H, W) or (H, W, 3) in which unknown pixels have the value of the nearest
-    known (H, W) one.
+    """Fill the unknown pixels of a texture (H, W) or (H, W, 3) with their nearest known ones.
 
     Viewers interpolate between pixels and reduce textures, which would bring in the background at
     the border.
@@ -172,15 +173,14 @@ def _triangles(heights: Float64Array, mask: Bools) -> NDArray[np.int32]:
     number = np.full(mask.shape, -1, np.int32)
     number[mask] = np.arange(len(heights))
     # The corners of each square, counter-clockwise from the top left (y is up).
-    squares = np.stack(
-        (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]), axis=-1
-    ).reshape(-1, 4)
+    corners = (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:])
+    squares = np.stack(corners, axis=-1).reshape(-1, 4)
     inside = squares >= 0
     whole = squares[inside.all(axis=1)]
     step = np.abs(heights[whole[:, :2]] - heights[whole[:, 2:]])
     across = step[:, 0] <= step[:, 1]
-    corners = {True: ([0, 1, 2], [0, 2, 3]), False: ([0, 1, 3], [1, 2, 3])}
-    parts = [whole[across == way][:, three] for way, halves in corners.items() for three in halves]
+    halves = {True: ([0, 1, 2], [0, 2, 3]), False: ([0, 1, 3], [1, 2, 3])}
+    parts = [whole[across == way][:, three] for way, pair in halves.items() for three in pair]
     three = inside.sum(axis=1) == 3
     parts.append(squares[three][inside[three]].reshape(-1, 3))
     return np.concatenate(parts)
@@ -196,21 +196,19 @@ def decimated_mesh(
     depth: Floats,
     mask: Bools,
     camera_matrix: Floats | None = None,
-    colours: NDArray[np.uint8] | None = None,
     *,
     n_triangles: int,
     normal_map: Floats,
     largest_step: float | None = None,
 ) -> SurfaceMesh:
-    """Return a mesh of about `n_triangles` triangles, with a texture of the normals of the normal
-    map.
+    """Return a mesh of about `n_triangles` triangles, with a texture of the normals.
 
     Edges are collapsed where this moves the surface least (Garland and Heckbert, Surface
     simplification using quadric error metrics, SIGGRAPH 1997). A mesh that has no more triangles is
     returned as it is.
 
     Args:
-        depth, mask, camera_matrix, colours, largest_step: see surface_mesh.
+        depth, mask, camera_matrix, largest_step: see surface_mesh.
         n_triangles: at least 1.
         normal_map: (H, W, 3), unit on the object, zero outside.
 
@@ -218,12 +216,16 @@ def decimated_mesh(
         UsageError: fast-simplification is not installed, or the largest step is negative.
         InputError: no triangle is left.
     """
-    mesh = _mesh_of_blocks(
-        depth, mask, camera_matrix, colours, n_triangles, normal_map, largest_step
-    )
-    if mesh is None:
+    # Collapsing all edges of a large map takes a lot of memory. If far fewer triangles than pixels
+    # are requested, a mesh of blocks with at least four times the requested number has the same
+    # shape, and the normal texture keeps the detail.
+    mesh, n_pixels = None, np.count_nonzero(mask)
+    step = int((2 * n_pixels / (4 * n_triangles)) ** 0.5)
+    if step > 1 and n_pixels > LARGE_MAP:
+        mesh = _mesh_of_blocks(depth, mask, camera_matrix, step, normal_map, largest_step)
+    if mesh is None or len(mesh.triangles) <= n_triangles:
         mesh = surface_mesh(
-            depth, mask, camera_matrix, colours, normal_map=normal_map, largest_step=largest_step
+            depth, mask, camera_matrix, normal_map=normal_map, largest_step=largest_step
         )
     if n_triangles >= len(mesh.triangles):
         return mesh
@@ -240,14 +242,12 @@ def decimated_mesh(
     vertices = vertices * pixel
     normals = vertex_normals(vertices, triangles)
     tangents = _tangents(vertices, normals, camera_matrix)
-    shape = normal_map.shape[:2]
-    points = image_points(vertices, shape, camera_matrix)
-    return replace(
-        mesh,
-        vertices=vertices.astype(np.float32),
-        triangles=triangles.astype(np.int32),
-        normals=normals.astype(np.float32),
-        uvs=texture_coordinates(points, shape),
+    points = image_points(vertices, mask.shape, camera_matrix)
+    return SurfaceMesh(
+        vertices.astype(np.float32),
+        triangles.astype(np.int32),
+        normals.astype(np.float32),
+        texture_coordinates(points, mask.shape),
         tangents=tangents.astype(np.float32),
         normal_texture=_normal_texture(points, triangles, normals, tangents, normal_map),
     )
@@ -257,21 +257,11 @@ def _mesh_of_blocks(
     depth: Floats,
     mask: Bools,
     camera_matrix: Floats | None,
-    colours: NDArray[np.uint8] | None,
-    n_triangles: int,
+    step: int,
     normal_map: Floats,
     largest_step: float | None,
-) -> SurfaceMesh | None:
-    """Return a mesh of blocks of a large map's pixels; None if its triangles would be too few, or
-    the map is small.
-
-    Collapsing all edges of a large map takes a lot of memory. If far fewer triangles than pixels
-    are requested, a mesh of blocks with at least four times the requested number has the same
-    shape, and the normal texture keeps the detail.
-    """
-    step = int((2 * np.count_nonzero(mask) / (4 * n_triangles)) ** 0.5)
-    if step < 2 or np.count_nonzero(mask) <= LARGE_MAP:
-        return None
+) -> SurfaceMesh:
+    """Return the mesh of a map's blocks of step x step pixels, in the frame of the map."""
     blocks = Blocks.of_step(mask, step)
     of_blocks = np.zeros((*blocks.mask.shape, 4))
     pixels = np.concatenate((depth[mask][:, None], normal_map[mask]), axis=1)
@@ -285,24 +275,21 @@ def _mesh_of_blocks(
         normal_map=unit(of_blocks[..., 1:]),
         largest_step=largest_step,
     )
-    if len(mesh.triangles) <= n_triangles:
-        return None
     shift = np.zeros(3)
     if camera_matrix is None:
         shift[:2] = step * np.array(blocks.mask.shape[::-1]) - mask.shape[::-1]
     vertices = mesh.vertices * scale + shift * (0.5, -0.5, 0)
-    texture = None if colours is None else fill_outside(colours, mask)
-    return replace(mesh, vertices=vertices.astype(np.float32), texture=texture)
+    return replace(mesh, vertices=vertices.astype(np.float32))
 
 
 def _tangents(
     vertices: Float64Array, normals: Float64Array, camera_matrix: Floats | None
 ) -> Float64Array:
-    """Return the unit tangents (V, 3): perpendicular to the normals, and along the surface in a row
-    of the image.
+    """Return the unit tangents (V, 3), which follow the rows of the image along the surface.
 
-    A row of the image shows the plane that contains the viewing rays of the row. This is how
-    viewers compute tangents themselves (MikkTSpace): the derivative of the position along u.
+    They are perpendicular to the normals. A row of the image shows the plane that contains the
+    viewing rays of the row. This is how viewers compute tangents themselves (MikkTSpace): the
+    derivative of the position along u.
     """
     along = np.array((1.0, 0.0, 0.0)) if camera_matrix is None else ray_basis(camera_matrix)[0]
     rays = np.array((0.0, 0.0, -1.0)) if camera_matrix is None else vertices
@@ -317,24 +304,20 @@ def _normal_texture(
     normals: Float64Array,
     tangents: Float64Array,
     normal_map: Floats,
-) -> NDArray[np.uint8]:
-    """Return the normal texture (H, W, 3) of a mesh. Pixels outside the mesh have the value of the
-    nearest inside.
+) -> Picture:
+    """Return the normal texture (H, W, 3) of a mesh.
 
-    `points` (V, 2) are the columns and rows of the vertices in the image, `triangles` (T, 3) their
-    numbers, `normals` and `tangents` (V, 3) unit. The normal map (H, W, 3) is zero off the object.
+    Pixels outside the mesh have the value of the nearest inside. `points` (V, 2) are the columns
+    and rows of the vertices in the image, `triangles` (T, 3) their numbers, `normals` and
+    `tangents` (V, 3) unit. The normal map (H, W, 3) is zero off the object.
     """
     texture = np.full(normal_map.shape, (128, 128, 255), np.uint8)
     known = np.zeros(normal_map.shape[:2], np.bool_)
     on_object = np.asarray(normal_map.any(axis=2))
     for number, weights, rows, columns in _covered_pixels(points, triangles, known.shape):
         seen = on_object[rows, columns]
-        corners, weights, rows, columns = (
-            triangles[number[seen]],
-            weights[seen],
-            rows[seen],
-            columns[seen],
-        )
+        corners, weights = triangles[number[seen]], weights[seen]
+        rows, columns = rows[seen], columns[seen]
         frames = (unit(np.einsum("qc,qcx->qx", weights, of[corners])) for of in (normals, tangents))
         texels = _in_frame(normal_map[rows, columns].astype(np.float64), *frames)
         texture[rows, columns] = np.rint((texels + 1) / 2 * 255)
@@ -345,13 +328,13 @@ def _normal_texture(
 def _in_frame(
     measured: Float64Array, normals: Float64Array, tangents: Float64Array
 ) -> Float64Array:
-    """Return the unit coordinates (Q, 3) of normals in frames T, B = N x T, N; T need not be
-    perpendicular to N.
+    """Return the unit coordinates (Q, 3) of normals in the frames T, B = N x T, N.
+
+    T need not be perpendicular to N.
     """
     bitangents = np.cross(normals, tangents)
-    along, up, out = (
-        np.einsum("qx,qx->q", measured, axis) for axis in (tangents, bitangents, normals)
-    )
+    axes = (tangents, bitangents, normals)
+    along, up, out = (np.einsum("qx,qx->q", measured, axis) for axis in axes)
     skew = np.einsum("qx,qx->q", tangents, normals)
     square = np.maximum(1 - skew**2, 1e-6)
     texels = np.stack((along - skew * out, up, out - skew * along), axis=1) / square[:, None]
@@ -361,9 +344,10 @@ def _in_frame(
 
 def _covered_pixels(
     points: Float64Array, triangles: Integers, shape: tuple[int, ...]
-) -> Iterator[tuple[NDArray[np.intp], Float64Array, NDArray[np.intp], NDArray[np.intp]]]:
-    """Yield the pixels whose centres are in triangles: triangle (Q,), barycentric coordinates (Q,
-    3), row, column.
+) -> Iterator[tuple[Indices, Float64Array, Indices, Indices]]:
+    """Yield the pixels whose centres are in triangles.
+
+    These are the triangle (Q,), barycentric coordinates (Q, 3), row and column of each.
     """
     for start in range(0, len(triangles), 50_000):
         numbers = np.arange(start, min(start + 50_000, len(triangles)))
@@ -376,28 +360,22 @@ def _covered_pixels(
         first = np.ceil(corners[..., 1].min(axis=1) - _OUTSIDE).clip(0, shape[0])
         last = np.floor(corners[..., 1].max(axis=1) + _OUTSIDE).clip(-1, shape[0] - 1)
         which, rows = _ranges(first, last)
-        slope, rest = (
-            forms[which, :, 0],
-            forms[which, :, 1] * rows[:, None] + forms[which, :, 2] + _OUTSIDE,
-        )
+        slope, by_row, constant = np.moveaxis(forms[which], 2, 0)
+        rest = by_row * rows[:, None] + constant + _OUTSIDE
         with np.errstate(divide="ignore", invalid="ignore"):
             crossing = -rest / slope
-        low = np.where(
-            slope > 0, crossing, np.where((slope == 0) & (rest < 0), np.inf, -np.inf)
-        ).max(axis=1)
+        elsewhere = np.where((slope == 0) & (rest < 0), np.inf, -np.inf)
+        low = np.where(slope > 0, crossing, elsewhere).max(axis=1)
         high = np.where(slope < 0, crossing, np.inf).min(axis=1)
-        span, columns = _ranges(
-            np.ceil(low).clip(0, shape[1]), np.floor(high).clip(-1, shape[1] - 1)
-        )
+        first, last = np.ceil(low).clip(0, shape[1]), np.floor(high).clip(-1, shape[1] - 1)
+        span, columns = _ranges(first, last)
         which, rows = which[span], rows[span]
         place = np.stack((columns, rows, np.ones(len(rows))), axis=1)
         yield numbers[which], np.einsum("qcx,qx->qc", forms[which], place), rows, columns
 
 
 def _barycentric_forms(corners: Float64Array) -> Float64Array:
-    """Return the forms (T, 3, 3) whose products with (column, row, 1) are the three barycentric
-    coordinates.
-    """
+    """Return forms (T, 3, 3) that map (column, row, 1) to the barycentric coordinates."""
     following, last = np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)
     edge = last - following
     normal = np.stack((-edge[..., 1], edge[..., 0]), axis=-1)
@@ -407,10 +385,8 @@ def _barycentric_forms(corners: Float64Array) -> Float64Array:
     return np.concatenate((normal, -np.einsum("tcx,tcx->tc", normal, following)[..., None]), axis=2)
 
 
-def _ranges(first: Float64Array, last: Float64Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the whole numbers from each first to its last, and before them the number of the range
-    of each.
-    """
+def _ranges(first: Float64Array, last: Float64Array) -> tuple[Indices, Indices]:
+    """Return the integers from each first to its last, and before them the index of their range."""
     lengths = np.maximum(last - first + 1, 0).astype(np.intp)
     which = np.repeat(np.arange(len(lengths)), lengths)
     within = np.arange(len(which)) - np.repeat(np.cumsum(lengths) - lengths, lengths)

@@ -1,5 +1,4 @@
-"""The files of a surface: meshes as glTF (GLB), PLY, OBJ and STL; depth maps as float32 NPY, TIFF
-and EXR, and as PNG.
+"""The files of a surface: meshes (glTF, PLY, OBJ, STL) and depth maps (NPY, TIFF, EXR, PNG).
 
 The command line needs the names in this file, so everything heavier than NumPy is imported in
 functions.
@@ -15,9 +14,9 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.errors import OutputError
+from splinecli.maths import Float32Array, Floats, Picture
 from splinecli.maths.transfer import decode_transfer, encode_srgb
 from splinecli.records.output_files import SURFACE_FILES
 from splinecli.system.machine import import_extra
@@ -36,19 +35,20 @@ GRAY = 204  # colour of a mesh without a texture, of 255
 class Surface:
     """A depth map and its mesh."""
 
-    depth: NDArray[np.floating]  # (H, W), NaN outside the object
+    depth: Floats  # (H, W), NaN outside the object
     mesh: SurfaceMesh  # the mesh of the same surface
     unit: str  # the name of the unit of both
     millimetres: float  # the length of this unit in a file of glTF
     # (H, W, 3), the normals of a surface that was levelled
-    level_normals: NDArray[np.float32] | None = None
+    level_normals: Float32Array | None = None
 
 
 def encode_surface(
     surface: Surface, formats: Sequence[str] = DEFAULT_FORMATS
 ) -> Iterator[tuple[str, Content]]:
-    """Yield the name and the content (see NewFiles.write) of each file of a surface; formats are
-    keys of SURFACE_FILES.
+    """Yield the name and the content (see NewFiles.write) of each file of a surface.
+
+    The formats are keys of SURFACE_FILES.
 
     Raises InputError if a mesh without triangles cannot be written as GLB.
     """
@@ -60,8 +60,9 @@ def encode_surface(
 
 
 def _encode_glb(surface: Surface) -> bytes:
-    """Encode binary glTF 2.0, in metres: the textures, lit from both sides; matte without a texture
-    of the gloss.
+    """Encode binary glTF 2.0 in metres, with textures that are lit from both sides.
+
+    Without a texture of the gloss, the surface is matte.
     """
     import trimesh
     from PIL import Image
@@ -73,8 +74,9 @@ def _encode_glb(surface: Surface) -> bytes:
         raise no_triangles()
 
     def add_rest(buffers: Any, tree: Any) -> None:
-        """Add what trimesh lacks. Without the tangents, viewers derive their own tangents in
-        different ways.
+        """Add what trimesh lacks.
+
+        Without the tangents, viewers derive their own tangents in different ways.
         """
         if mesh.specular is not None:
             _add_specular(buffers, tree, mesh.specular)
@@ -116,9 +118,10 @@ def _encode_glb(surface: Surface) -> bytes:
     return glb
 
 
-def _add_specular(buffers: Any, tree: Any, specular: NDArray[np.float32]) -> None:
-    """Add KHR_materials_specular to a glTF file of one material: the reflectance (H, W) relative to
-    the usual one.
+def _add_specular(buffers: Any, tree: Any, specular: Float32Array) -> None:
+    """Add KHR_materials_specular, the reflectance (H, W) relative to the usual one.
+
+    The glTF file has one material.
     """
     relative = specular / USUAL_SPECULAR
     largest = float(relative.max())
@@ -135,7 +138,7 @@ def _add_specular(buffers: Any, tree: Any, specular: NDArray[np.float32]) -> Non
     tree["extensionsUsed"] = ["KHR_materials_specular"]
 
 
-def _encode_texture(picture: NDArray[np.uint8]) -> bytes:
+def _encode_texture(picture: Picture) -> bytes:
     from PIL import Image
 
     file = io.BytesIO()
@@ -144,8 +147,9 @@ def _encode_texture(picture: NDArray[np.uint8]) -> bytes:
 
 
 def _encode_ply(surface: Surface) -> bytes:
-    """Encode binary PLY, with the normals and colours of the vertices. A comment has the unit's
-    name.
+    """Encode binary PLY, with the normals and colours of the vertices.
+
+    A comment has the unit's name.
     """
     import trimesh
 
@@ -158,12 +162,11 @@ def _encode_ply(surface: Surface) -> bytes:
 
 
 def _encode_obj(surface: Surface) -> dict[str, bytes]:
-    """Encode OBJ with normals, texture coordinates and, with colours, textures. A comment has the
-    unit's name.
+    """Encode OBJ with normals, texture coordinates and, with colours, textures.
 
-    With a gloss, the material has the maps of the extension for physically-based rendering, and
-    Phong's highlight of the same height and about the same width for programs that do not read
-    these maps.
+    A comment has the unit's name. With a gloss, the material has the maps of the extension for
+    physically-based rendering, and Phong's highlight of the same height and about the same width
+    for programs that do not read these maps.
     """
     import trimesh
     from PIL import Image
@@ -201,7 +204,7 @@ def _encode_obj(surface: Surface) -> dict[str, bytes]:
     return {"mesh.obj": text.encode(), **files}
 
 
-def encode_tiff(values: NDArray[np.float32], description: str) -> bytes:
+def encode_tiff(values: Float32Array, description: str) -> bytes:
     """Return the TIFF file of a map (H, W) or (H, W, C)."""
     import tifffile
 
@@ -220,8 +223,7 @@ def _encode_exr(surface: Surface) -> bytes:
 
 
 def _encode_png(surface: Surface) -> bytes:
-    """Encode the depth map as 16-bit gray: 0 outside the object, 1 for the smallest value to 65535
-    for the largest.
+    """Encode the depth map as 16-bit gray: 0 outside the object, then 1 to 65535 by depth.
 
     The text `depth` of the PNG file has these values and their unit.
     """
@@ -267,13 +269,12 @@ def _textured(mesh: SurfaceMesh, material: Any) -> Any:
     return trimesh.visual.TextureVisuals(mesh.uvs * (1, -1) + (0, 1), material)
 
 
-def encode_exr(pixels: NDArray[np.floating], attributes: Mapping[str, str]) -> bytes:
-    """Return the file of a map of float16 or float32, without loss (ZIP), with texts by name in its
-    header.
+def encode_exr(pixels: Floats, attributes: Mapping[str, str]) -> bytes:
+    """Return the EXR file of a map of float16 or float32, with texts by name in its header.
 
-    The map is (H, W, 3), the channels R, G and B, or (H, W), the channel Y. Blender reads these
-    names. Raises UsageError if OpenEXR is not installed, or OutputError if the folder for temporary
-    files cannot be written.
+    Compression (ZIP) is lossless. The map is (H, W, 3), the channels R, G and B, or (H, W), the
+    channel Y. Blender reads these names. Raises UsageError if OpenEXR is not installed, or
+    OutputError if the folder for temporary files cannot be written.
     """
     library = import_extra("OpenEXR", "exr")
     header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage, **attributes}
@@ -289,8 +290,6 @@ def encode_exr(pixels: NDArray[np.floating], attributes: Mapping[str, str]) -> b
 
 
 def check_exr(formats: Sequence[str]) -> None:
-    """Raise UsageError, before the work, if EXR files are to be written and the library is not
-    installed.
-    """
+    """Raise UsageError if EXR files are to be written and the library is not installed."""
     if "exr" in formats:
         import_extra("OpenEXR", "exr")

@@ -213,7 +213,7 @@ def refusals_as_output_errors(path: Path) -> Iterator[None]:
         reason = error.strerror or f"{error}; the disk may be full"
         kind = NoRoomError if error.errno in (None, *_NO_ROOM) else OutputError
         raise kind(
-            f"cannot be written ({reason})", path=path, hint="Choose another place with -o"
+            f"cannot be written ({reason})", path, hint="Choose another place with -o"
         ) from error
 
 
@@ -224,8 +224,8 @@ def as_splinecli_error(error: OSError, path: Path | None = None) -> InputError |
     `path` is named if the error does not name a file.
     """
     if error.errno in _NO_ROOM:
-        return NoRoomError(f"cannot be written ({error.strerror})", path=error.filename or path)
-    return InputError(f"cannot be read ({error.strerror or error})", path=error.filename or path)
+        return NoRoomError(f"cannot be written ({error.strerror})", error.filename or path)
+    return InputError(f"cannot be read ({error.strerror or error})", error.filename or path)
 
 
 def check_writable(folder: Path) -> None:
@@ -235,12 +235,12 @@ def check_writable(folder: Path) -> None:
         while not place.exists():
             place = place.parent
     except OSError as error:
-        raise OutputError(f"cannot be a folder ({error.strerror})", path=folder) from error
+        raise OutputError(f"cannot be a folder ({error.strerror})", folder) from error
     hint = "Choose another place with -o"
     if not place.is_dir():
-        raise OutputError("found a file, expected a folder for the results", path=place, hint=hint)
+        raise OutputError("found a file, expected a folder for the results", place, hint=hint)
     if not os.access(place, os.W_OK | os.X_OK):
-        raise OutputError("no permission to write into this folder", path=place, hint=hint)
+        raise OutputError("no permission to write into this folder", place, hint=hint)
 
 
 def check_free(folder: Path, names: Iterable[str], *, overwrite: bool) -> None:
@@ -250,8 +250,11 @@ def check_free(folder: Path, names: Iterable[str], *, overwrite: bool) -> None:
     check_writable(folder)
     for name in () if overwrite else names:
         if (folder / name).exists():
-            hint = "Add --overwrite, or choose another place with -o"
-            raise OutputError(f"{name} already exists in this folder", path=folder, hint=hint)
+            raise OutputError(
+                f"{name} already exists in this folder",
+                folder,
+                hint="Add --overwrite, or choose another place with -o",
+            )
 
 
 def write_text(path: Path, content: str) -> None:
@@ -287,10 +290,10 @@ def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
     """
     mode = find_mode(path)
     if mode is None:
-        raise InputError("the file does not exist", path=path)
+        raise InputError("the file does not exist", path)
     if not (stat.S_ISREG(mode) or (pipe and is_substitution(path))):
         raise InputError(
-            f"found {_KINDS.get(stat.S_IFMT(mode), 'a device')}, expected {expected}", path=path
+            f"found {_KINDS.get(stat.S_IFMT(mode), 'a device')}, expected {expected}", path
         )
 
 
@@ -300,7 +303,7 @@ def reading(path: Path, what: str = "file") -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(f"the {what} cannot be read ({error.strerror})", path=path) from None
+        raise InputError(f"the {what} cannot be read ({error.strerror})", path) from None
 
 
 def is_found_file(path: Path) -> bool:
@@ -343,4 +346,4 @@ def resolve(path: Path) -> Path:
 
 
 def _unreadable(path: Path, reason: str | None) -> InputError:
-    return InputError(f"cannot be read ({reason})", path=path)
+    return InputError(f"cannot be read ({reason})", path)

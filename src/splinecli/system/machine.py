@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 # The message for each extra
 _PROBLEMS = {
-    "cluster": "--workers above 1 and --cluster need the package distributed, which is"
-    " not installed",
+    "cluster": "--workers above 1 and --cluster need the package distributed,"
+    " which is not installed",
     "exr": "EXR files need the package OpenEXR, which is not installed",
     "heif": "HEIC images need the package pillow-heif, which is not installed",
     "mesh": "--decimate needs the package fast-simplification, which is not installed",
@@ -50,7 +50,7 @@ def import_extra(
     except ImportError as cause:
         alternative = f", or {otherwise}" if otherwise else ""
         raise error(
-            _PROBLEMS[extra], path=path, hint=f"Run pip install 'splinecli[{extra}]'{alternative}"
+            _PROBLEMS[extra], path, hint=f"Run pip install 'splinecli[{extra}]'{alternative}"
         ) from cause
 
 
@@ -201,7 +201,8 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 Device = Literal["auto", "cpu", "cuda"]
-Precision = Literal["auto", "float32", "bfloat16"]
+NumberFormat = Literal["float32", "bfloat16"]
+Precision = Literal["auto"] | NumberFormat
 
 
 def choose_device(name: Device | str) -> torch.device:
@@ -218,7 +219,7 @@ def choose_device(name: Device | str) -> torch.device:
     return torch.device("cuda" if available and name != "cpu" else "cpu")
 
 
-def choose_precision(name: Precision, device: torch.device) -> Literal["float32", "bfloat16"]:
+def choose_precision(name: Precision, device: torch.device) -> NumberFormat:
     """Return the number format of this name; "auto" is bfloat16 if the device supports it
     natively.
     """
@@ -270,15 +271,15 @@ def cgroup_quotas() -> list[float]:
         # first is "max" or -1 without a quota.
         for names in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):
             with suppress(OSError):
-                quota, period = " ".join(
-                    (folder / name).read_text("utf-8") for name in names
-                ).split()
-                quotas += [] if quota in ("max", "-1") else [float(quota) / float(period)]
+                content = " ".join((folder / name).read_text("utf-8") for name in names)
+                quota, period = content.split()
+                if quota not in ("max", "-1"):
+                    quotas.append(float(quota) / float(period))
     return quotas
 
 
-Part = TypeVar("Part")
-Result = TypeVar("Result")
+_Part = TypeVar("_Part")
+_Result = TypeVar("_Result")
 _lock, _users, _threads = Lock(), 0, 0
 
 
@@ -310,17 +311,17 @@ def one_thread_each() -> Iterator[int]:
 
 
 def in_order(
-    function: Callable[[Part], Result],
-    parts: Iterable[Part],
+    function: Callable[[_Part], _Result],
+    parts: Iterable[_Part],
     threads: int = 1,
     start: Callable[[], object] | None = None,
-) -> Iterator[Result]:
+) -> Iterator[_Result]:
     """Yield function(part) of each part, in order, computed on so many threads, each of which calls
     `start` first.
 
     At most one result more than there are threads is kept. An error is raised when its part is due.
     """
-    waiting: deque[Future[Result]] = deque()
+    waiting: deque[Future[_Result]] = deque()
     pool = ThreadPoolExecutor(threads, "part", start)
     try:
         for part in parts:
@@ -334,7 +335,7 @@ def in_order(
 
 
 @contextmanager
-def meanwhile(function: Callable[[], Result]) -> Iterator[Callable[[], Result]]:
+def meanwhile(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]]:
     """Start function() on another thread, and yield a callable that waits for its result or raises
     its error.
     """
@@ -342,7 +343,7 @@ def meanwhile(function: Callable[[], Result]) -> Iterator[Callable[[], Result]]:
         yield pool.submit(function).result
 
 
-def side_by_side(function: Callable[[Part], Result], parts: Iterable[Part]) -> Iterator[Result]:
+def side_by_side(function: Callable[[_Part], _Result], parts: Iterable[_Part]) -> Iterator[_Result]:
     """Yield function(part) of each part as in_order does, without gradients, on as many threads as
     PyTorch uses.
 

@@ -3,10 +3,11 @@
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Protocol
+from typing import Any, Protocol
 
-# a function that is called with the number of pixels that were just finished
-Progress = Callable[[int], object]
+# a function that is called with the amount of work that was just done: a number of pixels, or a
+# share of the whole
+Progress = Callable[[Any], object]
 
 
 def ignore(*_: object, **__: object) -> None:

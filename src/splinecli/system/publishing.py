@@ -75,12 +75,12 @@ def _locked_file(path: Path, *, wait: bool) -> IO[str]:
         except PermissionError:
             if not path.exists():
                 raise
-            problem = "this lock file belongs to another user, who may be writing into the folder"
-            hint = (
-                "If no splinecli process of that user runs, remove the file. Otherwise choose"
-                " another -o"
-            )
-            raise OutputError(problem, path=path, hint=hint) from None
+            raise OutputError(
+                "this lock file belongs to another user, who may be writing into the folder",
+                path,
+                hint="If no splinecli process of that user runs, remove the file."
+                " Otherwise choose another -o",
+            ) from None
         try:
             got = _try_lock(file)
         except OSError:  # some network drives have no locks
@@ -91,11 +91,11 @@ def _locked_file(path: Path, *, wait: bool) -> IO[str]:
                 return file
         file.close()
         if not got and not wait:
-            problem, hint = (
+            raise BusyError(
                 "another splinecli process is writing into this folder",
-                "Wait for it to end",
+                path.parent,
+                hint="Wait for it to end, or choose another -o",
             )
-            raise BusyError(problem, path=path.parent, hint=f"{hint}, or choose another -o")
         if not got:
             time.sleep(0.02)
 
@@ -106,9 +106,7 @@ def _open_lock(path: Path) -> IO[str]:
     """
     # A pipe would wait for its other end without O_NONBLOCK. A link might lead anywhere.
     flags = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)
-    refused = OutputError(
-        "is not a file, so it cannot lock the folder", path=path, hint="Remove it"
-    )
+    refused = OutputError("is not a file, so it cannot lock the folder", path, hint="Remove it")
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | flags, 0o666)
     except (FileNotFoundError, PermissionError):
@@ -205,12 +203,10 @@ class NewFiles:
                 self.hidden[name] = Path(file.name)
                 if isinstance(content, np.ndarray):
                     np.save(file, content, allow_pickle=False)
+                elif isinstance(content, bytes):
+                    file.write(content)
                 else:
-                    file.write(
-                        content
-                        if isinstance(content, bytes)
-                        else content.encode(errors="backslashreplace")
-                    )
+                    file.write(content.encode(errors="backslashreplace"))
             sync(self.hidden[name])
 
     def publish(self, report: str | None, stale: Iterable[str]) -> None:
@@ -259,7 +255,7 @@ def refuse_link(folder: Path) -> None:
     """Raise OutputError if a folder is really a link, which may lead anywhere."""
     if folder.is_symlink():
         raise OutputError(
-            "found a link, expected a folder", path=folder, hint="Remove it, or choose another -o"
+            "found a link, expected a folder", folder, hint="Remove it, or choose another -o"
         )
 
 
@@ -271,12 +267,12 @@ def is_plain(path: Path) -> bool:
 def _check_place(path: Path, folder: Path) -> None:
     """Raise OutputError if no file can be renamed to a path in a folder or its subfolders."""
     if path.is_dir() and not path.is_symlink():
-        raise OutputError("found a folder, expected a file", path=path)
+        raise OutputError("found a folder, expected a file", path)
     if path.parent == folder:
         return
     refuse_link(path.parent)
     if path.parent.exists() and not path.parent.is_dir():
-        raise OutputError("found a file, expected a folder", path=path.parent)
+        raise OutputError("found a file, expected a folder", path.parent)
 
 
 def _remove(path: Path, folder: Path) -> None:

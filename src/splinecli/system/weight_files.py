@@ -3,22 +3,20 @@ unpickled.
 """
 
 import hashlib
-import json
 from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from splinecli.errors import ModelError
-from splinecli.system.files import file_sha256, is_special, parse_json, utf8_name, write_bytes
+from splinecli.system.files import file_sha256, is_special, parse_json, utf8_name
 
 # largest tensor file to read, in bytes; a checkpoint of the paper's networks has 170 MB
 LONGEST = 500_000_000
-_LENGTH_BYTES = 8  # size of the header length at the start of a safetensors file
+LENGTH_BYTES = 8  # size of the header length at the start of a safetensors file
 Module = TypeVar("Module", bound=nn.Module)
 SHIPPED = resources.files("splinecli") / "assets"
 
@@ -33,33 +31,6 @@ def tensors_sha256(tensors: dict[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-def serialise(tensors: dict[str, Tensor], metadata: dict[str, str]) -> bytes:
-    """Return the bytes of a safetensors file, identical for identical content.
-
-    The library itself writes the metadata in random order.
-    """
-    content = save(tensors, metadata)
-    length = int.from_bytes(content[:_LENGTH_BYTES], "little")
-    header = json.loads(content[_LENGTH_BYTES : _LENGTH_BYTES + length])
-    header["__metadata__"] = dict(sorted(metadata.items()))
-    ordered = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
-    ordered += b" " * (-len(ordered) % _LENGTH_BYTES)  # tensors start at a multiple of 8 bytes
-    return (
-        len(ordered).to_bytes(_LENGTH_BYTES, "little") + ordered + content[_LENGTH_BYTES + length :]
-    )
-
-
-def save_module(module: nn.Module, path: Path, metadata: dict[str, str]) -> None:
-    """Write the parameters of a module as float16, with metadata and their checksum. Raises
-    OutputError.
-    """
-    half = {name: tensor.detach().cpu().half() for name, tensor in module.state_dict().items()}
-    tensors = {
-        name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in half.items()
-    }
-    write_bytes(path, serialise(tensors, {**metadata, "tensors_sha256": tensors_sha256(tensors)}))
-
-
 def read_tensors(
     path: Path, expected_format: str, hint: str
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -70,31 +41,33 @@ def read_tensors(
     """
     try:
         if path.is_dir():
-            raise ModelError("is a folder", path=path, hint=hint)
+            raise ModelError("is a folder", path, hint=hint)
         if is_special(path):
-            raise ModelError("is not a file", path=path, hint=hint)
+            raise ModelError("is not a file", path, hint=hint)
         if not path.is_file():
-            raise ModelError("no such file", path=path, hint=hint)
+            raise ModelError("no such file", path, hint=hint)
         check_length(path, hint)
         with path.open("rb") as start:
-            if (
-                length := int.from_bytes(start.read(_LENGTH_BYTES), "little")
-            ) > 1 << 20:  # a tensor takes about 100
+            length = int.from_bytes(start.read(LENGTH_BYTES), "little")
+            if length > 1 << 20:  # a tensor takes about 100
                 raise SafetensorError(f"a header of {length} bytes")
             with safe_open(utf8_name(path, start), framework="pt") as file:
                 metadata = file.metadata() or {}
                 found = metadata.get("format", "none")
                 if found != expected_format:
-                    problem = f"wrong format: found {found}, expected {expected_format}"
-                    raise ModelError(problem, path=path, hint=hint)
+                    raise ModelError(
+                        f"wrong format: found {found}, expected {expected_format}",
+                        path,
+                        hint=hint,
+                    )
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError) as error:
         raise ModelError(
-            f"not a safetensors file, or cut short ({error})", path=path, hint=hint
+            f"not a safetensors file, or cut short ({error})", path, hint=hint
         ) from error
     if metadata.get("tensors_sha256") != tensors_sha256(tensors):
         raise ModelError(
-            "damaged: the tensors do not match the checksum in the file", path=path, hint=hint
+            "damaged: the tensors do not match the checksum in the file", path, hint=hint
         )
     return tensors, metadata
 
@@ -103,7 +76,7 @@ def check_length(path: Path, hint: str) -> None:
     """Raise ModelError for a file of more than LONGEST bytes."""
     if (length := path.stat().st_size) > LONGEST:
         found = f"found {length / 1e6:.0f} MB, expected at most {LONGEST / 1e6:.0f}"
-        raise ModelError(found, path=path, hint=hint)
+        raise ModelError(found, path, hint=hint)
 
 
 def read_json_entry(
@@ -118,7 +91,7 @@ def read_json_entry(
         return parse_json(metadata.get(key, ""), kind)
     except ValueError as error:
         raise ModelError(
-            f"the entry {key!r} in the file is not JSON of the expected form ({error})", path=path
+            f"the entry {key!r} in the file is not JSON of the expected form ({error})", path
         ) from error
 
 
@@ -130,9 +103,7 @@ def load_strictly(network: nn.Module, tensors: dict[str, Tensor], path: Path) ->
         network.load_state_dict(tensors, strict=True)
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:200]
-        raise ModelError(
-            f"the tensors do not fit the configuration ({reason})", path=path
-        ) from error
+        raise ModelError(f"the tensors do not fit the configuration ({reason})", path) from error
 
 
 def load_shipped(module: Module, entry: dict[str, str], expected_format: str) -> Module:

@@ -1,6 +1,4 @@
-"""The contact sheet of a pixel set: its scenes, each with its normals and two images of each
-material.
-"""
+"""The contact sheet of a pixel set: normals and two images of each material for each scene."""
 
 from __future__ import annotations
 
@@ -9,9 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.maths import Bools, Floats
+from splinecli.maths import Bools, Floats, Picture
 from splinecli.maths.normals import encode_picture
-from splinecli.pictures.maps import Picture
 
 if TYPE_CHECKING:
     from splinecli.workshop.pixel_sets.store import Entry, PixelSet
@@ -21,8 +18,9 @@ MOST_SCENES = 120
 
 
 def contact_sheet(pixel_set: PixelSet) -> Picture:
-    """Return an RGB picture (H, W, 3) with a strip for each scene, or for an even choice of at most
-    MOST_SCENES.
+    """Return an RGB picture (H, W, 3) with a strip for each scene.
+
+    Of many scenes, MOST_SCENES are chosen evenly.
     """
     scenes: dict[str, list[Entry]] = {}
     for entry in pixel_set.entries:

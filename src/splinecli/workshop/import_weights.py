@@ -48,13 +48,12 @@ _MOST_RECORDS, _LONGEST_PICKLE, _MOST_STEPS = 10_000, 1 << 20, 100_000
 
 
 def import_official(li_net_file: Path, ne_net_file: Path) -> SplineNet:
-    """Return the authors' network, float32, in evaluation mode, from two files of state
-    dictionaries.
+    """Return the authors' network from two files of state dictionaries.
 
-    Their generator (G) is LI-Net, their discriminator (D) is NE-Net. Dropout is disabled in
-    evaluation mode, but the authors' test code leaves it enabled. Raises ModelError if a file
-    cannot be read or is not a state dictionary, or a tensor is missing, unknown, of another shape
-    or not finite.
+    It is float32, in evaluation mode. Their generator (G) is LI-Net, their discriminator (D) is
+    NE-Net. Dropout is disabled in evaluation mode, but the authors' test code leaves it enabled.
+    Raises ModelError if a file cannot be read or is not a state dictionary, or a tensor is missing,
+    unknown, of another shape or not finite.
     """
     network = SplineNet(NetworkConfig(size="paper", grid="cnn-ps"))
     assert network.li_net is not None  # this configuration interpolates
@@ -96,8 +95,9 @@ def _read_li_net(path: Path, li_net: nn.Module) -> dict[str, Tensor]:
 def _rename(
     path: Path, network: nn.Module, names: dict[str, str], dropped: dict[str, torch.Size]
 ) -> dict[str, Tensor]:
-    """Return their tensors under our names, float32; `names` maps ours to theirs, `dropped` lists
-    unused shapes.
+    """Return the authors' tensors under our names, float32.
+
+    `names` maps ours to theirs, `dropped` lists unused shapes.
     """
     state = _read_state(path)
     hint = "Give the authors' NUMBER-G.ckpt first and NUMBER-D.ckpt second"
@@ -131,8 +131,9 @@ def _rename(
 
 
 def _read_state(path: Path) -> dict[str, Tensor]:
-    """Read the tensors in a file written by torch.save. Only tensors and plain containers are
-    unpickled.
+    """Read the tensors in a file written by torch.save.
+
+    Only tensors and plain containers are unpickled.
     """
     hint = "Give a checkpoint of the authors' PyTorch code, such as 200000-G.ckpt"
     try:

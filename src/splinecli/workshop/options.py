@@ -5,70 +5,59 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from msgspec import Meta
+from msgspec import NODEFAULT, Meta
 
 from splinecli.errors import UsageError
 from splinecli.pipeline import infer_options as shared
-from splinecli.pipeline.infer_options import OUTPUT, Display, Workers
-from splinecli.records.base import Count, Natural, NotNegative, Option, Record, Seed
+from splinecli.pipeline.infer_options import OUTPUT, Display, WorkerOptions
+from splinecli.records.base import Count, Natural, NotNegative, Record, Seed, flag, option
 from splinecli.workshop import training
 
 
 class PrepareOptions(Display, frozen=True, kw_only=True):
     """The options of `prepare`."""
 
-    sources: Annotated[
-        tuple[Path, ...],
-        Option(
-            "Arguments",
-            "SOURCE",
-            "Captures with ground truth, folders of them, CyclesPS trees.",
-            repeated=True,
-        ),
-    ] = ()
+    sources: tuple[Path, ...] = option(
+        "Arguments",
+        "Captures with ground truth, folders of them, CyclesPS trees.",
+        "SOURCE",
+        value=(),
+    )
     as_stored: shared.AsStored = False
-    white_level: shared.WhiteLevel = None
+    white_level: shared.GivenWhiteLevel = None
     update: shared.Update = False
-    scenes: Annotated[Natural, Option("Scenes", "N", "Render N random scenes.")] = 0
-    meshes: Annotated[
-        tuple[Path, ...],
-        Option(
-            "Scenes",
-            "FILE",
-            "Render a scene of this mesh (PLY, OBJ, STL, OFF). May be repeated.",
-            names=("--mesh",),
-            repeated=True,
-        ),
-    ] = ()
-    views: Annotated[
-        Natural,
-        Option(
-            "Scenes",
-            "N",
-            "Render each mesh N times, from random views. 0 renders it once, along its +z axis.",
-        ),
-    ] = 0
-    reliefs: Annotated[
-        tuple[Path, ...],
-        Option(
-            "Scenes",
-            "FILE",
-            "Put this tileable normal map on half of the scenes. May be repeated.",
-            names=("--relief",),
-            repeated=True,
-        ),
-    ] = ()
-    size: Annotated[
-        Annotated[int, Meta(ge=8)] | None,
-        Option("Scenes", "PIXELS", "Width and height of the rendered images.", default="128"),
-    ] = None
-    n_lights: Annotated[
-        Annotated[int, Meta(ge=16)] | None,
-        Option("Scenes", "N", "Number of lights of a rendered scene.", default="100"),
-    ] = None
-    seed: Annotated[Seed, Option("Scenes", "S", "Seed of the random draws.")] = 0
-    output: Annotated[Path, Option("Output", "SET", "Folder of the pixel set.", names=OUTPUT)]
-    processes: Workers = Workers()
+    scenes: Natural = option("Scenes", "Render N random scenes.", "N", value=0)
+    meshes: tuple[Path, ...] = option(
+        "Scenes",
+        "Render a scene of this mesh (PLY, OBJ, STL, OFF). May be repeated.",
+        "FILE",
+        value=(),
+        names="--mesh",
+    )
+    views: Natural = option(
+        "Scenes",
+        "Render each mesh N times, from random views. 0 renders it once, along its +z axis.",
+        "N",
+        value=0,
+    )
+    reliefs: tuple[Path, ...] = option(
+        "Scenes",
+        "Put this tileable normal map on half of the scenes. May be repeated.",
+        "FILE",
+        value=(),
+        names="--relief",
+    )
+    size: Annotated[int, Meta(ge=8)] | None = option(
+        "Scenes", "Width and height of the rendered images.", "PIXELS", "128"
+    )
+    n_lights: Annotated[int, Meta(ge=16)] | None = option(
+        "Scenes", "Number of lights of a rendered scene.", "N", "100"
+    )
+    seed: Seed = option("Scenes", "Seed of the random draws.", "S", value=0)
+    output: Path = option(
+        "Output", "Folder of the pixel set.", "SET", value=NODEFAULT, names=OUTPUT
+    )
+    processes: WorkerOptions = WorkerOptions()
 
 
 def parse_light_counts(text: str) -> dict[str, int]:
@@ -94,116 +83,87 @@ def parse_light_counts(text: str) -> dict[str, int]:
 class TrainOptions(Record, frozen=True, kw_only=True):
     """The options of `train`."""
 
-    sets: Annotated[
-        tuple[Path, ...],
-        Option("Arguments", "SET", "Pixel sets made by 'splinecli prepare'.", repeated=True),
-    ] = ()
-    preset: Annotated[
-        str | None,
-        Option(
-            "Settings",
-            "NAME",
-            f"Settings to begin with: {', '.join(training.PRESET_NAMES)}.",
-            default=training.DEFAULT_PRESET,
-            complete=training.PRESET_NAMES,
-        ),
-    ] = None
-    config: Annotated[
-        Path | None, Option("Settings", "FILE", "Settings from a TOML file or a run's config.json.")
-    ] = None
-    param: Annotated[
-        tuple[str, ...],
-        Option(
-            "Settings",
-            "NAME=VALUE",
-            "One setting, such as pixels.wall_share=0.3. May be repeated.",
-            repeated=True,
-        ),
-    ] = ()
-    start_from: Annotated[
-        str | None,
-        Option(
-            "Settings",
-            "NAME|FILE",
-            "Begin with these weights.",
-            default="random weights; preset refine: spline-net",
-            complete=shared.complete_weights,
-        ),
-    ] = None
-    seed: Annotated[Seed | None, Option("Settings", "S", "Seed of the run.", default="0")] = None
-    generator_weight: Annotated[
-        NotNegative | None,
-        Option(
-            "Pixels",
-            "W",
-            "Weight of generated pixels; each SET has weight 1.",
-            default="0; 1 without SET",
-        ),
-    ] = None
-    n_lights: Annotated[
-        dict[str, int] | None,
-        Option(
-            "Pixels",
-            "K|MIN-MAX",
-            "Number of lights of each pixel.",
-            default="the preset's",
-            parse=parse_light_counts,
-        ),
-    ] = None
-    steps: Annotated[
-        Count | None,
-        Option(
-            "Length",
-            "N",
-            "Train for N steps.",
-            default=f"{training.DEFAULT_STEPS:,}; presets paper: {training.PAPER_STEPS:,}, refine:"
-            f" {training.REFINE_STEPS:,}",
-        ),
-    ] = None
-    minutes: Annotated[
-        Annotated[float, Meta(ge=0.01)] | None,
-        Option(
-            "Length",
-            "M",
-            "Train for M minutes instead of a number of steps.",
-            default="train for --steps",
-        ),
-    ] = None
-    resume: Annotated[bool, Option("Length", "", "Continue from the run's checkpoint.")] = False
-    output: Annotated[
-        Path,
-        Option(
-            "Output",
-            "RUN",
-            f"Folder of the run. Its files are updated every {training.CHECKPOINT_SECONDS}"
-            " seconds.",
-            names=OUTPUT,
-        ),
-    ]
-    tensorboard: Annotated[
-        bool, Option("Output", "", "Also write RUN/tensorboard (needs the extra 'tensorboard').")
-    ] = False
+    sets: tuple[Path, ...] = option(
+        "Arguments", "Pixel sets made by 'splinecli prepare'.", "SET", value=()
+    )
+    preset: str | None = option(
+        "Settings",
+        f"Settings to begin with: {', '.join(training.PRESET_NAMES)}.",
+        "NAME",
+        training.DEFAULT_PRESET,
+        complete=training.PRESET_NAMES,
+    )
+    config: Path | None = option(
+        "Settings", "Settings from a TOML file or a run's config.json.", "FILE"
+    )
+    param: tuple[str, ...] = option(
+        "Settings",
+        "One setting, such as pixels.wall_share=0.3. May be repeated.",
+        "NAME=VALUE",
+        value=(),
+    )
+    start_from: str | None = option(
+        "Settings",
+        "Begin with these weights.",
+        "NAME|FILE",
+        "random weights; preset refine: spline-net",
+        complete=shared.complete_weights,
+    )
+    seed: Seed | None = option("Settings", "Seed of the run.", "S", "0")
+    generator_weight: NotNegative | None = option(
+        "Pixels", "Weight of generated pixels; each SET has weight 1.", "W", "0; 1 without SET"
+    )
+    n_lights: dict[str, int] | None = option(
+        "Pixels",
+        "Number of lights of each pixel.",
+        "K|MIN-MAX",
+        "the preset's",
+        parse=parse_light_counts,
+    )
+    steps: Count | None = option(
+        "Length",
+        "Train for N steps.",
+        "N",
+        f"{training.DEFAULT_STEPS:,}; presets paper: {training.PAPER_STEPS:,}, refine:"
+        f" {training.REFINE_STEPS:,}",
+    )
+    minutes: Annotated[float, Meta(ge=0.01)] | None = option(
+        "Length", "Train for M minutes instead of a number of steps.", "M", "train for --steps"
+    )
+    resume: bool = flag("Length", "Continue from the run's checkpoint.")
+    output: Path = option(
+        "Output",
+        f"Folder of the run. Its files are updated every {training.CHECKPOINT_SECONDS} seconds.",
+        "RUN",
+        value=NODEFAULT,
+        names=OUTPUT,
+    )
+    tensorboard: bool = flag(
+        "Output", "Also write RUN/tensorboard (needs the extra 'tensorboard')."
+    )
     quiet: shared.Quiet = False
     device: shared.DeviceName = "auto"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.steps is not None and self.minutes is not None:
-            raise UsageError("--steps and --minutes contradict each other", hint="Leave one out")
+    CONFLICTS = (("steps", "minutes", shared.LEAVE_ONE),)
 
 
 class ImportOptions(Record, frozen=True, kw_only=True):
     """The options of `import-weights`."""
 
-    li_net: Annotated[
-        Path, Option("Arguments", "G.ckpt", "The authors' LI-Net, which they call the generator.")
-    ]
-    ne_net: Annotated[
-        Path,
-        Option("Arguments", "D.ckpt", "The authors' NE-Net, which they call the discriminator."),
-    ]
-    output: Annotated[
-        Path, Option("Output", "FILE.safetensors", "The weight file to write.", names=OUTPUT)
-    ]
-    overwrite: Annotated[bool, Option("Output", "", "Replace an existing file.")] = False
+    li_net: Path = option(
+        "Arguments",
+        "The authors' LI-Net, which they call the generator.",
+        "G.ckpt",
+        value=NODEFAULT,
+    )
+    ne_net: Path = option(
+        "Arguments",
+        "The authors' NE-Net, which they call the discriminator.",
+        "D.ckpt",
+        value=NODEFAULT,
+    )
+    output: Path = option(
+        "Output", "The weight file to write.", "FILE.safetensors", value=NODEFAULT, names=OUTPUT
+    )
+    overwrite: bool = flag("Output", "Replace an existing file.")
     quiet: shared.Quiet = False

@@ -1,5 +1,7 @@
 """Build a pixel set from captures with ground truth and from rendered scenes."""
 
+from collections.abc import Callable, Generator
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -7,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from splinecli.capture import find_captures
-from splinecli.errors import InputError, UsageError
+from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.pictures.maps import encode_png
-from splinecli.pipeline.distribution import Item, LostError, distributor
+from splinecli.pipeline.distribution import LostError, WorkItem, distributor
 from splinecli.pipeline.infer_options import ClusterOptions
 from splinecli.records.output_files import CONTACT_SHEET
 from splinecli.system.files import UNFINISHED, as_splinecli_error, check_writable, write_bytes
@@ -31,12 +33,15 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
     function again resumes it: InputError for a mesh, OutputError, also for a scene with other
     settings in the set, or UsageError if there is nothing to prepare.
     """
-    output, config = options.output, SceneConfig()
-    config = replace(
-        config, size=options.size or config.size, lights=options.n_lights or config.lights
-    )
+    output, usual = options.output, SceneConfig()
+    size, n_lights = options.size or usual.size, options.n_lights or usual.lights
     plan = ScenePlan(
-        config, options.seed, options.scenes, options.meshes, options.views, options.reliefs
+        replace(usual, size=size, lights=n_lights),
+        options.seed,
+        options.scenes,
+        options.meshes,
+        options.views,
+        options.reliefs,
     )
     captures = [folder for source in options.sources for folder in find_captures(source)]
     if not captures and not plan.names:
@@ -52,16 +57,19 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
         named = entries.name_captures(captures, writer)
         with observer.progress("preparing", len(named) + len(plan.names)) as advance:
             skipped: list[dict[str, Any]] = []
-            how: dict[str, Any] = {
-                "as_stored": options.as_stored,
-                "white_level": options.white_level,
-            }
             for name, folder in named.items():
                 try:
-                    entries.add_capture(writer, name, folder, update=options.update, **how)
+                    entries.add_capture(
+                        writer,
+                        name,
+                        folder,
+                        update=options.update,
+                        as_stored=options.as_stored,
+                        white_level=options.white_level,
+                    )
                     observer.say(writer.describe(name))
                 except (InputError, CaptureChangedError, OSError) as refused:
-                    error = (
+                    error: SplinecliError = (
                         as_splinecli_error(refused, folder)
                         if isinstance(refused, OSError)
                         else refused
@@ -97,8 +105,9 @@ def _render_scenes(
     observer: Observer,
     advance: Advance,
 ) -> None:
-    """Render the scenes missing from the set, in this process or on workers, and add them in the
-    order of the plan.
+    """Render the scenes missing from the set, and add them in the order of the plan.
+
+    This process or workers render them.
 
     Raises LostError if the workers of a scene were lost (after finishing all other scenes), and any
     error from a worker or the set.
@@ -110,48 +119,61 @@ def _render_scenes(
         advance(share - reached)
         reached = share
 
-    def finish(position: int) -> None:
-        nonlocal reached
-        for name in plan.entry_names(position).values():
-            observer.say(writer.describe(name))
-        reach(1.0)
-        reached = 0.0
-
-    positions = range(len(plan.names))
-    missing = [
-        p for p in positions if not all(name in writer for name in plan.entry_names(p).values())
-    ]
-    if cluster is None:
+    add = _add_here if cluster is None else partial(_add_from_workers, cluster, observer)
+    with closing(add(writer, plan, reach)) as positions:
         for position in positions:
-            if position in missing:
-                plan.add(writer, position, *plan.render(position, reach))
-            finish(position)
-        return
-    in_set = ((position, None) for position in positions if position not in missing)
+            for name in plan.entry_names(position).values():
+                observer.say(writer.describe(name))
+            reach(1.0)
+            reached = 0.0
+
+
+def _missing(writer: PixelSetWriter, plan: ScenePlan) -> list[int]:
+    """Return the positions of the plan's scenes that are not in the set, or not whole."""
+    names = map(plan.entry_names, range(len(plan.names)))
+    return [n for n, each in enumerate(names) if not all(name in writer for name in each.values())]
+
+
+def _add_here(
+    writer: PixelSetWriter, plan: ScenePlan, reach: Callable[[float], None]
+) -> Generator[int, None, None]:
+    """Add the missing scenes to the set, and yield the position of each scene that is in it."""
+    missing = _missing(writer, plan)
+    for position in range(len(plan.names)):
+        if position in missing:
+            plan.add(writer, position, *plan.render(position, reach))
+        yield position
+
+
+def _add_from_workers(
+    cluster: ClusterOptions, observer: Observer, writer: PixelSetWriter, plan: ScenePlan, _: object
+) -> Generator[int, None, None]:
+    """Do the same with scenes that workers render. The order is that of the plan."""
+    missing = _missing(writer, plan)
+    # What is rendered, by position: its shape, an error, or None for a scene in the set.
     rendered: dict[int, str | LostError | None] = {}
+    position, folder = 0, writer.folder
     # A worker writes a scene to a hidden file of the set. Only this process adds it to the set.
-    render = partial(_render, plan, writer.folder)
-    position = 0
+    render = partial(_render, plan, folder)
     try:
-        with distributor(render, writer.folder, cluster, observer) as workers:
-            ended = (
-                (item.args[0], shape)
-                for item, shape in workers.run(Item((n,), plan.names[n]) for n in missing)
-            )
+        with distributor(render, folder, cluster, observer) as workers:
+            in_set = ((n, None) for n in range(len(plan.names)) if n not in missing)
+            items = (WorkItem((n,), plan.names[n]) for n in missing)
+            ended = ((item.args[0], shape) for item, shape in workers.run(items))
             for number, result in chain(in_set, ended):
                 rendered[number] = result
                 while position in rendered:
                     shape = rendered[position]
                     if isinstance(shape, str):
-                        path = _path(writer.folder, position)
+                        path = _path(folder, position)
                         plan.add(writer, position, shape, entries.load_rendered(path))
                         path.unlink()
                     if not isinstance(shape, LostError):
-                        finish(position)
+                        yield position
                     position += 1
     finally:
         for number in missing:
-            _path(writer.folder, number).unlink(missing_ok=True)
+            _path(folder, number).unlink(missing_ok=True)
     for result in rendered.values():
         if isinstance(result, LostError):
             raise result

@@ -18,7 +18,7 @@ from PIL import Image, ImageFile
 from PIL.TiffImagePlugin import IFDRational
 
 from scenes import ring_lights, with_chunk, write_capture
-from splinecli.capture import open_capture, read_image, read_mask
+from splinecli.capture import CaptureOptions, open_capture, read_image, read_mask
 from splinecli.capture.formats.facts import (
     UPRIGHT,
     Exposure,
@@ -302,7 +302,7 @@ def test_reading(tmp_path):
 def test_mixed_exposures_are_divided_out(tmp_path):
     folder = capture(tmp_path / "mixed", (1, 60), (1, 60), (1, 30))
     for options in ({}, {"intensities": "equal"}):  # equal lamps do not make equal exposures
-        source = open_capture(folder, **options)
+        source = open_capture(folder, CaptureOptions(**options))
         # The third image got twice the light of the others; the mean is 4 / 3.
         assert_allclose(source.light_intensities[:, 1], [0.75, 0.75, 1.5])
         assert (source.intensities_known, source.intensities_measured) == (bool(options), False)

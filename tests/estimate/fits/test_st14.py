@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from scenes import Floats, cap_directions, halfway
-from splinecli.estimate.fits.ia14 import fit
+from splinecli.estimate.fits.ia14 import fit_ia14
 from splinecli.estimate.fits.st14 import solve_st14
 from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.estimate.methods.estimator import LeastSquares
@@ -176,7 +176,7 @@ def test_optimum_is_the_librarys(kind, count):
         observations /= observations.max(axis=1, keepdims=True)
     else:
         observations = rendered(truth, lights, 7)
-    normals, increments = fit(torch.as_tensor(observations), torch.as_tensor(lights))
+    normals, increments = fit_ia14(torch.as_tensor(observations), torch.as_tensor(lights))
     for intensities, n, d in zip(observations, normals.numpy(), increments.numpy(), strict=True):
         hessian, mean, monotone, used = objective_of(intensities, lights, prior_weight=0.01)
         # On the constraint mean'x = 1 the added term is constant; the library asks for a definite

@@ -19,7 +19,7 @@ from splinecli.estimate.methods.estimator import (
     UNKNOWN_ERROR,
     LeastSquares,
     StudentSize,
-    confidence,
+    confident_share,
     student_sizes,
 )
 from splinecli.lights.lighting import LightingAt, PixelLighting
@@ -173,8 +173,8 @@ def test_it_learns_where_its_teacher_is_unsure():
     observations = (shade(normals, LIGHTS) ** np.where(dull, 1, 2)[:, None]).astype(np.float32)
     errors = np.where(dull[:, None], log_median(1), log_median(12))
     found = learn(Remembering(observations, normals, errors))
-    learned = confidence(found.estimate_with_error(observations, LIGHTS)[1])
-    truth = confidence(errors.astype(np.float32))
+    learned = confident_share(found.estimate_with_error(observations, LIGHTS)[1])
+    truth = confident_share(errors.astype(np.float32))
     assert np.abs(learned[dull].mean() - truth[dull].mean()) < 0.1
     assert np.abs(learned[~dull].mean() - truth[~dull].mean()) < 0.1
 

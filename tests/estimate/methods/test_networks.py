@@ -19,13 +19,14 @@ from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.estimate.methods.batched import NetworkEstimator, context_sample, rotations_of
 from splinecli.estimate.methods.estimator import CONFIDENT_DEG
 from splinecli.estimate.networks.li_ne_net import probability_within
-from splinecli.estimate.networks.spline_net import SplineNet, to_pixel_frame
+from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import LoadedNetwork, manifest, resolve_weights
 from splinecli.evaluation.protocol import Protocol
 from splinecli.lights.lighting import LightingAt, PixelLighting
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.system.weight_files import SHIPPED
 from splinecli.workshop.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
+from splinecli.workshop.training.objective import to_pixel_frame
 from tiny_networks import random_network
 
 

@@ -18,9 +18,9 @@ from splinecli.estimate.methods import Estimator, MethodOptions, make_estimator,
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
-from splinecli.estimate.networks.weights import save_weights
 from splinecli.lights.lighting import PixelLighting
 from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.workshop.save_weights import save_weights
 from tiny_networks import TINY
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])

@@ -12,8 +12,8 @@ from distributions import seeded
 from splinecli.estimate.fits.least_squares import alternating_signs
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.refine_net import (
-    CHANNELS,
     COARSEST,
+    FEATURE_CHANNELS,
     RefineNet,
     channels,
     split_features,
@@ -21,7 +21,12 @@ from splinecli.estimate.networks.refine_net import (
 )
 from splinecli.estimate.networks.set_branch import ContextLayer
 from splinecli.estimate.networks.spline_net import SplineNet
-from splinecli.estimate.refinement.features import Turn, refine_features, turn_features, turn_maps
+from splinecli.estimate.refinement.features import (
+    MapTurn,
+    refine_features,
+    turn_features,
+    turn_maps,
+)
 from tiny_networks import TINY, random_network
 
 HEIGHT, WIDTH = 6, 9
@@ -40,7 +45,7 @@ def random_net(*, twice: bool = False) -> RefineNet:
 def random_maps(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     generator = seeded(seed)
     mask = (torch.rand(1, 1, height, width, generator=generator) < 0.9).float()
-    features = torch.randn(1, CHANNELS, height, width, generator=generator) * mask
+    features = torch.randn(1, FEATURE_CHANNELS, height, width, generator=generator) * mask
     return features, mask
 
 
@@ -82,7 +87,7 @@ def test_features_turn_with_the_image(quarters, mirror):
     expected = features_of(
         moved(observations), turned(lights.T).T, turned(moved(normals)), moved(error)
     )
-    turn = Turn(quarters, mirror)
+    turn = MapTurn(quarters, mirror)
     features = features_of(observations, lights, normals, error)
     found = turn_features(features, turn)
     found_normals = turn_maps(normals, turn, vectors=((0, 1),))

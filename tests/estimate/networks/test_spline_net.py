@@ -16,19 +16,11 @@ from distributions import seeded
 from splinecli.estimate.fits.least_squares import fit_lambertian
 from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.estimate.networks.config import STARTING_FITS, NetworkConfig, fit_normals
-from splinecli.estimate.networks.li_ne_net import (
-    MapEncoder,
-    error_negative_log_likelihood,
-    probability_within,
-)
-from splinecli.estimate.networks.spline_net import (
-    Rotation,
-    SplineNet,
-    to_capture_frame,
-    to_pixel_frame,
-)
+from splinecli.estimate.networks.li_ne_net import MapEncoder, probability_within
+from splinecli.estimate.networks.spline_net import Rotation, SplineNet, to_capture_frame
 from splinecli.maths.observation_map import cell_directions, map_scale, rotate_about_view_axis
 from splinecli.workshop.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
+from splinecli.workshop.training.objective import error_negative_log_likelihood, to_pixel_frame
 from tiny_networks import TINY, random_network
 
 SET = {"set_width": 16, "set_layers": 2, "fits": ["ls"]}

@@ -17,8 +17,9 @@ from splinecli.errors import ModelError
 from splinecli.estimate.networks import weights
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
-from splinecli.estimate.networks.weights import FORMAT, load_weights, resolve_weights, save_weights
+from splinecli.estimate.networks.weights import WEIGHTS_FORMAT, load_weights, resolve_weights
 from splinecli.system.weight_files import tensors_sha256
+from splinecli.workshop.save_weights import save_weights
 from tiny_networks import TINY, random_network
 
 
@@ -31,7 +32,7 @@ def saved(tmp_path: Path) -> Path:
 def write_like_splinecli(
     path: Path, network: SplineNet, tensors: dict[str, Tensor], **changes: str
 ) -> None:
-    metadata = {"format": FORMAT, "config": json.dumps(network.config.to_dict())}
+    metadata = {"format": WEIGHTS_FORMAT, "config": json.dumps(network.config.to_dict())}
     save_file(tensors, path, metadata | {"tensors_sha256": tensors_sha256(tensors)} | changes)
 
 

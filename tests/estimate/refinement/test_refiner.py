@@ -24,11 +24,10 @@ from splinecli.estimate.methods import make_estimator
 from splinecli.estimate.methods.batched import NetworkEstimator
 from splinecli.estimate.methods.estimator import UNKNOWN_ERROR
 from splinecli.estimate.networks.config import NetworkConfig
-from splinecli.estimate.networks.refine_net import CHANNELS, RefineNet, channels
+from splinecli.estimate.networks.refine_net import FEATURE_CHANNELS, RefineNet, channels
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import LoadedNetwork
-from splinecli.estimate.refinement.detail import REACH as DETAIL_REACH
-from splinecli.estimate.refinement.detail import restore_detail
+from splinecli.estimate.refinement.detail import DETAIL_REACH, restore_detail
 from splinecli.estimate.refinement.features import refine_features
 from splinecli.estimate.refinement.refiner import NetworkRefiner
 from splinecli.evaluation.protocol import Protocol
@@ -191,7 +190,7 @@ def photographed(
     normals = (truth if seen is None else seen).flatten(1).T
     signs = alternating_signs(lights)
     features = refine_features(observations, lights, normals, torch.zeros(SIDE**2, 2), 1.0, signs)
-    return features.T.reshape(CHANNELS, SIDE, SIDE)
+    return features.T.reshape(FEATURE_CHANNELS, SIDE, SIDE)
 
 
 def photographed_with_noise(truth: Tensor, noise: float, lights: Tensor = FEW_LIGHTS) -> Tensor:

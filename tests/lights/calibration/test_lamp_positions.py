@@ -26,9 +26,9 @@ from splinecli.lights.calibration.balls import (
 )
 from splinecli.lights.calibration.circle import Circle
 from splinecli.lights.calibration.lamps import (
+    calibration_lines,
     calibration_report,
     intersect_rays,
-    summary_lines,
     triangulate_lamps,
 )
 from splinecli.maths.normals import unit
@@ -172,7 +172,7 @@ def test_two_balls_give_positions(tmp_path, render_ball):
     # The balls see the lamps in directions up to 9 degrees apart, which is no disagreement.
     assert report["disagreement_deg"]["largest"] > 3
     assert report["warnings"] == []
-    assert "the lamps are 3" in summary_lines(report)[-1]
+    assert "the lamps are 3" in calibration_lines(report)[-1]
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -185,7 +185,8 @@ def test_lamps_without_positions(tmp_path, render_ball, known):
         combine_balls(balls), None, None, picture="calibration.png", lamps=found
     )
     assert (
-        summary_lines(report)[-1] == "the lamps' distances are unknown: they are treated as distant"
+        calibration_lines(report)[-1]
+        == "the lamps' distances are unknown: they are treated as distant"
     )
     expected = (
         "put the balls farther apart" if known else "If the lamps are near, add --camera-matrix."
@@ -229,9 +230,9 @@ def test_one_ball(directions):
     assert found["light_intensities"] is None
     assert found["warnings"] == []
     assert found["balls"][0]["highlights"][0] == [1.235, 2.0]
-    assert summary_lines(found) == [
-        "ball: circle 50.0, 40.0, radius 30.0 pixels (from --circle, 100 % of the outline visible, "
-        "spread 0.0 pixels)"
+    assert calibration_lines(found) == [
+        "ball: circle 50.0, 40.0, radius 30.0 pixels (from --circle, 100 % of the outline visible,"
+        " spread 0.0 pixels)"
     ]
 
 
@@ -243,7 +244,8 @@ def test_balls_that_disagree(directions, degrees, warned):
     assert found["disagreement_deg"] == {"mean": degrees / 2, "largest": degrees / 2}
     assert bool(found["warnings"]) == warned
     assert (
-        f"the balls differ from their mean by {degrees / 2:.1f} degrees" in summary_lines(found)[-1]
+        f"the balls differ from their mean by {degrees / 2:.1f} degrees"
+        in calibration_lines(found)[-1]
     )
 
 

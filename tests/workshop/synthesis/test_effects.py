@@ -15,7 +15,6 @@ from torch.testing import assert_close
 
 from distributions import SHARE, N, assert_uniform, seeded
 from scenes import Floats
-from splinecli.materials.principled import PrincipledMaterial
 from splinecli.maths.normals import angle_between_deg
 from splinecli.maths.observation_map import cell_directions, dot
 from splinecli.maths.transfer import decode_transfer
@@ -30,6 +29,7 @@ from splinecli.workshop.synthesis.batches import (
 )
 from splinecli.workshop.synthesis.lights import draw_light_counts, draw_light_directions
 from splinecli.workshop.synthesis.pixels import Wall, draw_ambient, draw_visible_normals, draw_wall
+from splinecli.workshop.synthesis.principled import PrincipledMaterial
 
 
 def test_walls_have_the_stated_shapes():

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy import integrate
 
 from distributions import seeded
-from splinecli.materials.principled import PrincipledMaterial
 from splinecli.workshop.synthesis.draw_materials import draw_material
+from splinecli.workshop.synthesis.principled import PrincipledMaterial
 
 Vectors = NDArray[np.float64]
 NAMES = tuple(field.name for field in fields(PrincipledMaterial))

@@ -15,7 +15,8 @@ from distributions import seeded
 from scenes import read_json
 from splinecli.errors import ModelError
 from splinecli.estimate.networks.spline_net import SplineNet
-from splinecli.estimate.networks.weights import load_weights, save_weights
+from splinecli.estimate.networks.weights import load_weights
+from splinecli.workshop.save_weights import save_weights
 from splinecli.workshop.synthesis.batches import PixelBatch
 from splinecli.workshop.synthesis.pixels import PixelGenerator
 from splinecli.workshop.training import CHECKPOINT, METRICS, WEIGHTS, loop

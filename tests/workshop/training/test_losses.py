@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 from distributions import seeded
 from splinecli.estimate.networks.config import NetworkConfig
-from splinecli.estimate.networks.spline_net import SplineNet, to_pixel_frame
+from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.maths.observation_map import cell_directions, sparse_map
 from splinecli.workshop.synthesis.batches import PixelBatch
 from splinecli.workshop.synthesis.pixels import PixelGenerator
@@ -28,6 +28,7 @@ from splinecli.workshop.training.objective import (
     dense_truth_in_frame,
     map_loss,
     mirror,
+    to_pixel_frame,
 )
 from tiny_networks import random_network
 

@@ -11,11 +11,12 @@ from torch.testing import assert_close
 
 from distributions import seeded
 from splinecli.errors import ModelError, UsageError
-from splinecli.estimate.networks.refine_net import CHANNELS
+from splinecli.estimate.networks.refine_net import FEATURE_CHANNELS
 from splinecli.estimate.networks.spline_net import SplineNet
-from splinecli.estimate.networks.weights import load_weights, resolve_weights, save_weights
+from splinecli.estimate.networks.weights import load_weights, resolve_weights
 from splinecli.maths.normals import unit
 from splinecli.workshop.pixel_sets.store import Pixels, PixelSet, PixelSetWriter
+from splinecli.workshop.save_weights import save_weights
 from splinecli.workshop.synthesis.batches import CaptureConfig
 from splinecli.workshop.synthesis.whole_capture import photograph_scene
 from splinecli.workshop.training import WEIGHTS, refinement, tasks
@@ -209,7 +210,7 @@ def test_captures_of_a_pool(refining, bumpy_set):
         return made
 
     one, again, other = pool(1).examples[0], pool(1).examples[0], pool(2).examples[0]
-    assert one.features.shape == (CHANNELS, 26, 26), "with the dark margin"
+    assert one.features.shape == (FEATURE_CHANNELS, 26, 26), "with the dark margin"
     assert torch.equal(one.features, again.features)
     assert not torch.equal(one.features, other.features)
     drawn = pool(1).draw(3, seeded(0))
@@ -256,7 +257,7 @@ def test_the_loss_of_detail_does_not_count_what_turns_all_normals(refining):
         return normalize(torch.cat((-slopes, torch.ones(1, 24, 24))), dim=0)
 
     def losses_of(estimate):
-        features = torch.zeros(1, CHANNELS, 24, 24)
+        features = torch.zeros(1, FEATURE_CHANNELS, 24, 24)
         features[0, :3] = estimate
         maps = SceneMaps(features, unit_of(slopes)[None], torch.ones(1, 1, 24, 24))
         return [

@@ -44,11 +44,11 @@ def damage_as_input_error(path: Path, problem: str, hint: str | None = None) -> 
     except SplinecliError:
         raise
     except PermissionError as error:
-        raise InputError(f"the file cannot be read ({error.strerror})", path=path) from None
+        raise InputError(f"the file cannot be read ({error.strerror})", path) from None
     except Exception as error:
         if is_out_of_memory(error):
             raise
-        raise InputError(problem, path=path, hint=hint) from error
+        raise InputError(problem, path, hint=hint) from error
 
 
 _STDERR_LOCK = threading.Lock()
@@ -110,20 +110,20 @@ def decode_tiff(file: BinaryIO, path: Path) -> Array | None:
         # than the picture. Empty parts have up to 2^16 bytes, such as the tables of a JPEG, and
         # tiles up to 2^24 more than the picture.
         expanded = math.prod(page.chunks) * page.dtype.itemsize
-        if expanded > 2 * page.nbytes + (1 << 24) or max(
-            page.databytecounts, default=0
-        ) > 2 * expanded + (1 << 16):
+        longest = max(page.databytecounts, default=0)
+        if expanded > 2 * page.nbytes + (1 << 24) or longest > 2 * expanded + (1 << 16):
             raise ValueError
         size = os.fstat(file.fileno()).st_size
         parts = zip(page.dataoffsets, page.databytecounts, strict=True)
         if any(count == 0 or offset + count > size for offset, count in parts):
-            raise InputError("the TIFF is truncated", path=path, hint=COPY_AGAIN)
+            raise InputError("the TIFF is truncated", path, hint=COPY_AGAIN)
         photometric = int(page.photometric)
         if photometric not in (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR):
-            problem = (
-                f"found a TIFF of the colour model {page.photometric.name}, expected gray or RGB"
+            raise InputError(
+                f"found a TIFF of the colour model {page.photometric.name}, expected gray or RGB",
+                path,
+                hint="Export it as RGB",
             )
-            raise InputError(problem, path=path, hint="Export it as RGB")
         pixels = _decode_page(page)
         if photometric == _WHITE_IS_ZERO:
             if pixels is None:
@@ -153,11 +153,9 @@ def pages(path: Path) -> list[Path]:
             count = len(page.parent.pages)
     except (InputError, OSError):
         return [path]
-    return (
-        [path.with_name(f"{path.name}[{number}]") for number in range(count)]
-        if 1 < count < 10_000
-        else [path]
-    )
+    if not 1 < count < 10_000:
+        return [path]
+    return [path.with_name(f"{path.name}[{number}]") for number in range(count)]
 
 
 @contextmanager
@@ -209,9 +207,7 @@ def _decode_page(page: Any) -> Array | None:
         return None
     try:
         pixels: Array = page.asarray()
-    except (
-        Exception
-    ) as error:  # the type of the error for a missing codec depends on tifffile's version
+    except Exception as error:  # of a type that depends on tifffile's version for a missing codec
         if is_out_of_memory(error):
             raise
         return None
@@ -334,5 +330,8 @@ def _libraw(path: Path) -> Iterator[ModuleType]:
     try:
         yield rawpy
     except (rawpy.LibRawError, OSError):
-        problem = "the RAW file is damaged or of a camera that LibRaw does not know"
-        raise InputError(problem, path=path, hint=f"Copy it again, or {otherwise}") from None
+        raise InputError(
+            "the RAW file is damaged or of a camera that LibRaw does not know",
+            path,
+            hint=f"Copy it again, or {otherwise}",
+        ) from None

@@ -57,16 +57,7 @@ StoredSize = tuple[tuple[int, ...], int]
 ORIENTATION, _EXIF = 0x0112, 0x8769
 _EXPOSURE = (0x829A, 0x829D, 0x8827)  # EXIF tags of exposure time, f-number and ISO sensitivity
 # also of the focal length; see balls.py
-_KEPT = (
-    *_EXPOSURE,
-    0x920A,
-    0xA002,
-    0xA20E,
-    0xA210,
-    0xA402,
-    0xA403,
-    0xA405,
-)
+_KEPT = (*_EXPOSURE, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA402, 0xA403, 0xA405)
 # chunks of a PNG before its pixels, or segments of a JPEG before its frame; usually a few dozen
 _MOST_PARTS = 10_000
 
@@ -121,9 +112,7 @@ class ImageHeader:
         if self.kind == "RAW":
             return decoders.raw_size(self.path)
         if self.stated_size is None:
-            raise InputError(
-                f"the {self.kind} is truncated", path=self.path, hint=decoders.COPY_AGAIN
-            )
+            raise InputError(f"the {self.kind} is truncated", self.path, hint=decoders.COPY_AGAIN)
         return self.stated_size
 
 
@@ -147,7 +136,7 @@ def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
         start, suffix = file.read(12), path.suffix.lower()
         file.seek(0)
         if not start:
-            raise InputError("the file is empty", path=path)
+            raise InputError("the file is empty", path)
         otherwise = "TGA" if suffix == ".tga" else None  # TGA files have no signature
         found = next((kind for mark, kind in _STARTS.items() if start.startswith(mark)), otherwise)
         if start[:4] == b"RIFF" or start[4:8] == b"ftyp":
@@ -155,7 +144,7 @@ def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
         kind = "RAW" if suffix in decoders.RAW_SUFFIXES else found
         if kind is None:
             raise InputError(
-                "found neither PNG, TIFF, JPEG, BMP, PGM, PPM, WebP, AVIF nor HEIC", path=path
+                "found neither PNG, TIFF, JPEG, BMP, PGM, PPM, WebP, AVIF nor HEIC", path
             )
         yield file, kind
 
@@ -230,27 +219,18 @@ def _png_facts(file: BinaryIO, path: Path) -> ImageHeader:
         except zlib.error:
             profile = b""
     # 100000 times the exponent of the encoding: 1 means linear.
-    encoded = b"sRGB" in chunks or int.from_bytes(chunks.get(b"gAMA", b"")[:4], "big") not in (
-        0,
-        100_000,
-    )
+    gamma = int.from_bytes(chunks.get(b"gAMA", b"")[:4], "big")
+    encoded = b"sRGB" in chunks or gamma not in (0, 100_000)
     curve = _curve(_ENCODED if encoded else StatedCurve(), profile)
     if b"cICP" in chunks:
-        curve = _CODE_POINTS.get(
-            int.from_bytes(chunks[b"cICP"][1:2], "big"), StatedCurve(unread=True)
-        )
+        code = int.from_bytes(chunks[b"cICP"][1:2], "big")
+        curve = _CODE_POINTS.get(code, StatedCurve(unread=True))
     # One number for each channel. Alpha, if there is one, comes last.
     stated = chunks.get(b"sBIT", b"")
     bits = set(stated[: 3 if len(stated) > 2 else 1])
     level = _level(bits.pop()) if size is not None and size[1] == 2 and len(bits) == 1 else None
-    return ImageHeader(
-        path,
-        "PNG",
-        size,
-        curve,
-        level,
-        _exif_tags(lambda tags: tags.load(chunks.get(b"eXIf", b""))),
-    )
+    exif = _exif_tags(lambda tags: tags.load(chunks.get(b"eXIf", b"")))
+    return ImageHeader(path, "PNG", size, curve, level, exif)
 
 
 def _jpeg_facts(file: BinaryIO, path: Path) -> ImageHeader:
@@ -410,14 +390,12 @@ def check_exposures(images: Sequence[ImageHeader]) -> None:
         first, expected = found[0]
         # Shutters and ISO numbers are rounded.
         if abs(exposure.relative / expected.relative - 1) > 0.1:
-            hint = (
-                "Expose all images alike, or give each image's exposure as the intensity of its"
-                " light"
+            raise InputError(
+                f"found an exposure of {exposure}, expected {expected} as in {first.path.name}",
+                facts.path,
+                hint="Expose all images alike, or give each image's exposure as the intensity of"
+                " its light (--intensities FILE)",
             )
-            problem = (
-                f"found an exposure of {exposure}, expected {expected} as in {first.path.name}"
-            )
-            raise InputError(problem, path=facts.path, hint=f"{hint} (--intensities FILE)")
 
 
 def exposure_factors(images: Sequence[ImageHeader]) -> tuple[list[float], str] | None:
@@ -442,15 +420,11 @@ def exposure_factors(images: Sequence[ImageHeader]) -> tuple[list[float], str] |
         f"The images were divided by the exposures that EXIF states, from {darkest} to {brightest}."
     )
     tags = {"exposure": 0xA402, "white balance": 0xA403}  # 0 is automatic
-    automatic = [
-        word
-        for word, tag in tags.items()
-        if any((facts.exif or {}).get(tag) == 0 for facts in images)
-    ]
+    stated = [facts.exif or {} for facts in images]
+    automatic = [word for word, tag in tags.items() if any(each.get(tag) == 0 for each in stated)]
     if automatic:
-        text += (
-            f" The camera chose {' and '.join(automatic)}: fix them, and expose all images alike."
-        )
+        chosen = " and ".join(automatic)
+        text += f" The camera chose {chosen}: fix them, and expose all images alike."
     return [exposure.relative / mean for exposure in found], text
 
 
@@ -466,11 +440,10 @@ def common_orientation(images: Sequence[ImageHeader]) -> int:
     orientations = [int(value) if value in range(1, 9) else UPRIGHT for value in stated]
     for facts, orientation in zip(asked, orientations, strict=True):
         if orientation != orientations[0]:
-            problem = (
-                f"found EXIF orientation {orientation}, expected {orientations[0]} as in"
-                f" {asked[0].path.name}"
-            )
             raise InputError(
-                problem, path=facts.path, hint="Export all images the same way up, without this tag"
+                f"found EXIF orientation {orientation}, expected {orientations[0]} as in"
+                f" {asked[0].path.name}",
+                facts.path,
+                hint="Export all images the same way up, without this tag",
             )
     return orientations[0] if orientations else UPRIGHT

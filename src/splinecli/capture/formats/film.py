@@ -7,6 +7,7 @@ different as possible.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,14 +31,7 @@ MOST_FRAMES, FEWEST_FRAMES = 24, 6
 _CANDIDATES = 1000  # most frames that are compared; longer films are subsampled by 2, 4 and so on
 # FFmpeg recognises playlists by their content, and these name other files. So only containers of
 # films are opened.
-_CONTAINERS = (
-    (4, b"ftyp"),
-    (4, b"moov"),
-    (4, b"mdat"),
-    (4, b"wide"),
-    (0, b"RIFF"),
-    (0, b"\x1a\x45\xdf\xa3"),
-)
+_CONTAINERS = re.compile(rb"....(ftyp|moov|mdat|wide)|RIFF|\x1a\x45\xdf\xa3", re.DOTALL)
 # A frame that may be chosen: its number, its linear thumbnail, its sharpness and its share of
 # clipped pixels.
 _Candidate = tuple[int, Float32Array, float, float]
@@ -69,15 +63,13 @@ def choose_frames(film: Path) -> tuple[int, ...]:
     )
     chosen = _farthest(thumbnails[usable])
     if len(chosen) < FEWEST_FRAMES:
-        problem = (
+        raise InputError(
             f"found {len(chosen)} of {len(numbers)} frames that are sharp and differ in their"
-            " light, expected"
+            f" light, expected at least {FEWEST_FRAMES}",
+            film,
+            hint="Film from a tripod while the lamp moves all around the object,"
+            " with focus and exposure locked",
         )
-        hint = (
-            "Film from a tripod while the lamp moves all around the object, with focus and"
-            " exposure locked"
-        )
-        raise InputError(f"{problem} at least {FEWEST_FRAMES}", path=film, hint=hint)
     return tuple(sorted(numbers[usable][chosen].tolist()))
 
 
@@ -117,8 +109,11 @@ def _candidates(film: Path) -> list[_Candidate]:
         if not found:
             raise ValueError
     if number < 0.8 * stated:
-        problem = f"the film breaks off: {number} of {stated:.0f} frames can be read"
-        raise InputError(problem, path=film, hint="Copy it again")
+        raise InputError(
+            f"the film breaks off: {number} of {stated:.0f} frames can be read",
+            film,
+            hint="Copy it again",
+        )
     return found
 
 
@@ -128,11 +123,9 @@ def _candidate(number: int, picture: NDArray[np.uint8]) -> _Candidate:
     def reduced(image: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
         share = side / max(image.shape[:2])
         size = max(1, round(image.shape[1] * share)), max(1, round(image.shape[0] * share))
-        return (
-            np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-            if share < 1
-            else image
-        )
+        if share >= 1:
+            return image
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
     small = reduced(picture, 512)
     gray = small.astype(np.float32).mean(axis=2)
@@ -172,11 +165,10 @@ def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
     problem = "the film is damaged, or in a form that cannot be read"
     hint = "Copy it again, or convert it to MP4 with H.264"
     with damage_as_input_error(film, problem, hint), film.open("rb") as file:
-        start = file.read(16)
-        if not any(start[place:].startswith(mark) for place, mark in _CONTAINERS):
+        if not _CONTAINERS.match(file.read(16)):
             raise InputError(
                 "found no film",
-                path=film,
+                film,
                 hint="MP4, MOV, AVI, MKV and WebM files are read as films",
             )
         file.seek(0)
@@ -188,12 +180,11 @@ def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
         try:
             if not video.isOpened():
                 raise ValueError
-            size = (
-                int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)),
-                int(video.get(cv2.CAP_PROP_FRAME_WIDTH)),
-                3,
+            height, width = (
+                int(video.get(side))
+                for side in (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH)
             )
-            check_stored_size(size, 1, film)
+            check_stored_size((height, width, 3), 1, film)
             yield video
         finally:
             with native_stderr():

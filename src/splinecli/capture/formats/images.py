@@ -41,11 +41,11 @@ class ExpectedSize:
         width.
         """
         if found[:2] != self.shape[:2]:
-            problem = (
+            raise InputError(
                 f"found {self.what} of {_size(found)} pixels, expected {_size(self.shape)} as in"
-                f" {self.like}"
+                f" {self.like}",
+                path,
             )
-            raise InputError(problem, path=path)
 
 
 def check_stored_size(
@@ -59,12 +59,11 @@ def check_stored_size(
     n_pixels, n_bytes = math.prod(shape[:2]), image_bytes(shape, item_bytes)
     takes = f"found an image of {_size(shape)} pixels, which takes"
     if n_pixels > LARGEST_IMAGE:
-        problem = (
-            f"{takes} {n_bytes / 1e9:.1f} GB of memory; expected at most {LARGEST_IMAGE / 1e6:g}"
-            " megapixels"
-        )
         raise InputError(
-            problem, path=path, hint="If the size is right, use a smaller copy of the image"
+            f"{takes} {n_bytes / 1e9:.1f} GB of memory; expected at most {LARGEST_IMAGE / 1e6:g}"
+            " megapixels",
+            path,
+            hint="If the size is right, use a smaller copy of the image",
         )
     check_memory(n_bytes, takes, path)
 
@@ -73,7 +72,7 @@ def check_vectors(shape: tuple[int, ...], path: Path) -> None:
     """Raise InputError if an array is not H x W x 3."""
     if len(shape) != 3 or shape[2] != 3:
         sizes = " x ".join(map(str, shape))
-        raise InputError(f"found an array of {sizes}, expected a normal map, H x W x 3", path=path)
+        raise InputError(f"found an array of {sizes}, expected a normal map, H x W x 3", path)
 
 
 def image_bytes(shape: tuple[int, ...], item_bytes: int) -> int:
@@ -85,10 +84,11 @@ def check_memory(n_bytes: int, takes: str, path: Path, *, hint: str | None = Non
     """Raise InputError if less memory is available; `takes` is the message's subject and verb."""
     available = available_memory()
     if n_bytes > available:
-        problem = (
-            f"{takes} {n_bytes / 1e9:.1f} GB of memory, but {available / 1e9:.1f} GB are available"
+        raise InputError(
+            f"{takes} {n_bytes / 1e9:.1f} GB of memory, but {available / 1e9:.1f} GB are available",
+            path,
+            hint=hint,
         )
-        raise InputError(problem, path=path, hint=hint)
 
 
 def _size(shape: tuple[int, ...]) -> str:
@@ -149,11 +149,11 @@ def decode_with_alpha(
         # It is read as a whole, with 64 MB for previews and colour profiles.
         length, most = os.fstat(file.fileno()).st_size, image_bytes(*size) + (1 << 26)
         if length > most:
-            problem = (
-                f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image"
-                " of this size"
+            raise InputError(
+                f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image of"
+                " this size",
+                path,
             )
-            raise InputError(problem, path=path)
         file.seek(0)
         pixels = _decode(file, kind, path)
     if expected is not None:
@@ -161,14 +161,15 @@ def decode_with_alpha(
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
     if pixels.shape[2] not in (1, 2, 3, 4):
-        raise InputError(
-            f"found {pixels.shape[2]} channels, expected 1 (gray) or 3 (RGB)", path=path
-        )
+        raise InputError(f"found {pixels.shape[2]} channels, expected 1 (gray) or 3 (RGB)", path)
     if pixels.dtype == np.bool_:
         pixels = pixels.astype(np.uint8) * np.uint8(255)
     if pixels.dtype not in (np.uint8, np.uint16, np.float16, np.float32, np.float64):
-        problem = f"found {pixels.dtype} pixels, expected 8-bit, 16-bit or floating-point ones"
-        raise InputError(problem, path=path, hint="Save the image with 16 bits")
+        raise InputError(
+            f"found {pixels.dtype} pixels, expected 8-bit, 16-bit or floating-point ones",
+            path,
+            hint="Save the image with 16 bits",
+        )
     if pixels.shape[2] in (2, 4):
         return pixels[:, :, :-1], pixels[:, :, -1]
     return pixels, None
@@ -192,7 +193,7 @@ def _decode(file: BinaryIO, kind: str, path: Path) -> Array:
         width, height, most, start = facts.pnm_header(data) or (0, 0, 0, 0)
         shape, dtype = (height, width, 1 if kind == "PGM" else 3), ">u2" if most > 255 else "u1"
         if len(data) < start + math.prod(shape) * np.dtype(dtype).itemsize:
-            raise InputError(f"the {kind} is truncated", path=path, hint=decoders.COPY_AGAIN)
+            raise InputError(f"the {kind} is truncated", path, hint=decoders.COPY_AGAIN)
         return np.frombuffer(data, dtype, math.prod(shape), start).reshape(shape).astype(dtype[-2:])
     if kind != "TIFF":
         (_check_png if kind == "PNG" else _check_jpeg)(data, path)
@@ -226,7 +227,7 @@ def _decode_with_opencv(data: bytes, page: int) -> Array:
     if pixels.dtype in (np.uint8, np.uint16, np.float32):
         code = cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
         # in place, and far faster than an index
-        return np.asarray(cv2.cvtColor(pixels, code, dst=pixels))
+        return cv2.cvtColor(pixels, code, dst=pixels)
     return pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]]
 
 
@@ -242,12 +243,12 @@ def _check_png(data: bytes, path: Path) -> None:
             break
         if zlib.crc32(view[body : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
             raise InputError(
-                "the PNG is damaged (a checksum is wrong)", path=path, hint=decoders.COPY_AGAIN
+                "the PNG is damaged (a checksum is wrong)", path, hint=decoders.COPY_AGAIN
             )
         if data[body : body + 4] == b"IEND":
             return
         position = end
-    raise InputError("the PNG is truncated", path=path, hint=decoders.COPY_AGAIN)
+    raise InputError("the PNG is truncated", path, hint=decoders.COPY_AGAIN)
 
 
 def _check_jpeg(data: bytes, path: Path) -> None:
@@ -268,7 +269,7 @@ def _check_jpeg(data: bytes, path: Path) -> None:
             if following is None:
                 break
             position = following.start()
-    raise InputError("the JPEG is truncated", path=path, hint=decoders.COPY_AGAIN)
+    raise InputError("the JPEG is truncated", path, hint=decoders.COPY_AGAIN)
 
 
 def read_image(path: StrPath, expected: ExpectedSize | None = None) -> Float32Array:
@@ -300,12 +301,13 @@ def to_linear(stored: Array, path: Path) -> Float32Array:
     lowest, highest = (values.min(), values.max()) if values.size else (0.0, 0.0)
     if not (np.isfinite(lowest) and np.isfinite(highest)):
         raise InputError(
-            "found a value that is not finite (NaN or infinity), expected a photograph", path=path
+            "found a value that is not finite (NaN or infinity), expected a photograph", path
         )
     if lowest < 0:
-        hint = "Set values below zero, such as noise after a dark frame was subtracted, to zero"
         raise InputError(
-            f"found the negative value {lowest:g}, expected a photograph", path=path, hint=hint
+            f"found the negative value {lowest:g}, expected a photograph",
+            path,
+            hint="Set values below zero, such as noise after a dark frame was subtracted, to zero",
         )
     return values
 
@@ -324,8 +326,11 @@ def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> Bools:
         return opaque
     largest = to_linear(stored.max(keepdims=True), path).item()
     if largest <= 0:
-        hint = "Paint the object white, or give no mask"
-        raise InputError("the mask is empty: every pixel is zero", path=path, hint=hint)
+        raise InputError(
+            "the mask is empty: every pixel is zero",
+            path,
+            hint="Paint the object white, or give no mask",
+        )
     return np.asarray((stored > stored.max() / 2).any(axis=2))
 
 

@@ -23,10 +23,16 @@ import numpy as np
 from splinecli.capture.formats import images
 from splinecli.capture.formats.decoders import damage_as_input_error, native_stderr
 from splinecli.capture.formats.facts import read_header
-from splinecli.capture.formats.numbers import MOST_TEXT, check_length, read_mat, read_number_rows
+from splinecli.capture.formats.numbers import (
+    MOST_TEXT,
+    check_text_length,
+    read_mat,
+    read_number_rows,
+)
 from splinecli.errors import InputError
 from splinecli.maths import Array, Bools, Float32Array, Float64Array
 from splinecli.maths.normals import SHORTEST_IN_PICTURE, Convention, decode_picture, unit
+from splinecli.maths.pixel_grid import slices
 from splinecli.system.files import StrPath, check_file, utf8_name
 from splinecli.system.machine import import_extra
 
@@ -91,11 +97,11 @@ def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Float32Array, bool]:
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in (".mat", ".npy", ".txt", ".png", ".tif", ".tiff", ".bmp"):
-        problem = (
+        raise InputError(
             f'found a ground truth of the type "{suffix}", expected .mat, .npy, .txt, .png, .tif or'
-            " .bmp"
+            " .bmp",
+            path,
         )
-        raise InputError(problem, path=path)
     if suffix != ".txt":
         stored = _read_vectors(
             path, images.ExpectedSize(mask.shape, "the images", "a ground truth")
@@ -105,9 +111,8 @@ def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Float32Array, bool]:
     filled = (values != 0).any(axis=2)
     as_stored, turned = np.count_nonzero(filled & mask), np.count_nonzero(filled[::-1] & mask)
     upside_down = bool(turned - as_stored > 0.02 * np.count_nonzero(mask))
-    return _to_normals(
-        _Stored(values[::-1] if upside_down else values, None, False), mask, path
-    ), upside_down
+    stored = _Stored(values[::-1] if upside_down else values, None, False)
+    return _to_normals(stored, mask, path), upside_down
 
 
 def _read_vectors(path: Path, expected: images.ExpectedSize | None) -> _Stored:
@@ -139,7 +144,7 @@ def _read_text(path: Path, height: int, width: int) -> Float64Array:
     """Return vectors (H, W, 3), one on each line. Raises InputError."""
     # characters of a number, with the separator after it
     most = 3 * height * width * 32 + MOST_TEXT
-    check_length(path, most, "a normal map")
+    check_text_length(path, most, "a normal map")
     try:
         rows = np.loadtxt(path, np.float64, ndmin=2, encoding="utf-8-sig")
     except (ValueError, OSError):
@@ -149,7 +154,7 @@ def _read_text(path: Path, height: int, width: int) -> Float64Array:
         problem = (
             f"found {rows.shape[0]} rows of {rows.shape[1]}, expected {height * width} rows of 3,"
         )
-        raise InputError(f"{problem} one for each pixel of {height} x {width}", path=path)
+        raise InputError(f"{problem} one for each pixel of {height} x {width}", path)
     return rows.reshape(height, width, 3)
 
 
@@ -163,13 +168,13 @@ def _to_normals(
     """
     values = stored.values
     if values.dtype.kind not in "fiu":
-        raise InputError(f"found normals of type {values.dtype}, expected real numbers", path=path)
+        raise InputError(f"found normals of type {values.dtype}, expected real numbers", path)
     if stored.is_picture or check_floats:
         _check_lengths(values, mask, path)
     normals = np.zeros(values.shape, np.float32)
     rows, columns = np.nonzero(mask)
-    for start in range(0, len(rows), _BLOCK):
-        block = rows[start : start + _BLOCK], columns[start : start + _BLOCK]
+    for part in slices(len(rows), _BLOCK):
+        block = rows[part], columns[part]
         if stored.is_picture:
             normals[block] = decode_picture(values[block])
         else:
@@ -178,7 +183,7 @@ def _to_normals(
                 np.where((np.abs(vectors) < _LARGEST).all(axis=1, keepdims=True), vectors, 0)
             )
     if not normals.any():
-        raise InputError("found no normal inside the mask, expected at least one", path=path)
+        raise InputError("found no normal inside the mask, expected at least one", path)
     return normals
 
 
@@ -199,11 +204,14 @@ def _check_lengths(stored: Array, mask: Bools, path: Path) -> None:
     share = float((np.abs(length[usable] - 1) < 0.1).mean())
     if share < 0.6:
         problem = (
-            f"found {100 * share:.0f} % of the pixels to be unit vectors (in a picture colour * 2"
-            " - 1), expected"
+            f"found {100 * share:.0f} % of the pixels to be unit vectors (in a picture colour * 2 -"
+            " 1), expected"
         )
-        hint = "If the background is not black, give a mask"
-        raise InputError(f"{problem} nearly all: these are not normals", path=path, hint=hint)
+        raise InputError(
+            f"{problem} nearly all: these are not normals",
+            path,
+            hint="If the background is not black, give a mask",
+        )
 
 
 def read_depth(path: Path, expected: images.ExpectedSize) -> Float64Array:
@@ -226,9 +234,10 @@ def read_depth(path: Path, expected: images.ExpectedSize) -> Float64Array:
         stored = stored[..., 0]
     if stored.ndim != 2 or stored.dtype.kind != "f":
         found = f"{stored.dtype} {' x '.join(map(str, stored.shape))}"
-        problem = f"found an array of {found}, expected floating-point numbers H x W"
         raise InputError(
-            problem, path=path, hint="Save the depth as .npy, floating-point TIFF or EXR"
+            f"found an array of {found}, expected floating-point numbers H x W",
+            path,
+            hint="Save the depth as .npy, floating-point TIFF or EXR",
         )
     depth = np.array(stored, np.float64)
     depth[~np.isfinite(depth)] = np.nan
@@ -249,17 +258,9 @@ def _read_exr(path: Path, expected: images.ExpectedSize) -> Array:
         with redirect_stdout(io.StringIO()) as printed, native_stderr():
             channels = library.File(name).channels()
     if printed.getvalue():
-        raise InputError("the EXR file is damaged and cannot be read", path=path)
-    for name in (
-        "Z",
-        "Y",
-        "R",
-        "V",
-        "depth.Z",
-        "RGB",
-        "RGBA",
-        *channels,
-    ):  # names of a depth, then any other
-        if name in channels:
-            return np.asarray(channels[name].pixels)
-    raise InputError("the EXR file has no channel", path=path)
+        raise InputError("the EXR file is damaged and cannot be read", path)
+    # The names of a depth, then any other.
+    for channel in ("Z", "Y", "R", "V", "depth.Z", "RGB", "RGBA", *channels):
+        if channel in channels:
+            return np.asarray(channels[channel].pixels)
+    raise InputError("the EXR file has no channel", path)

@@ -43,7 +43,7 @@ lights.
 DECIMAL_POINT = "A comma separates columns; write decimals with a point"
 
 
-class Row(NamedTuple):
+class NumberRow(NamedTuple):
     """A row of numbers, its one-based line in the file, and this line as written,
     without comments.
     """
@@ -58,7 +58,7 @@ class NumberRows:
     """The rows of numbers of a text file, at least one, all finite; their lengths may differ."""
 
     path: Path
-    rows: tuple[Row, ...] = field(repr=False)
+    rows: tuple[NumberRow, ...] = field(repr=False)
     # of each row's image, without folders; None if rows begin with numbers
     names: tuple[str, ...] | None = None
     intensities: Float64Array | None = None  # (R, 3), RGB, of the lights of a file that has them
@@ -73,9 +73,12 @@ class NumberRows:
         usual = 3 if 3 in lengths and lengths.count(3) * 2 >= len(lengths) else lengths[0]
         for (_, line, text), length in zip(self.rows, lengths, strict=True):
             if length != usual:
-                hint = DECIMAL_POINT if length > usual and has_decimal_commas(text) else None
-                problem = f"found {columns(length)}, expected {usual} as in the other lines"
-                raise InputError(problem, path=self.path, line=line, hint=hint)
+                raise InputError(
+                    f"found {columns(length)}, expected {usual} as in the other lines",
+                    self.path,
+                    line=line,
+                    hint=DECIMAL_POINT if length > usual and has_decimal_commas(text) else None,
+                )
         return np.array([row.numbers for row in self.rows], np.float64)
 
 
@@ -86,24 +89,21 @@ def columns(count: int) -> str:
 
 def has_decimal_commas(text: str) -> bool:
     """Return whether a line looks like numbers with decimal commas, such as "0,5 0,3 0,8"."""
-    return (
-        "." not in text
-        and re.search(r"\d,\d", text) is not None
-        and re.search(r"[\s;]", text) is not None
-    )
+    has_both = re.search(r"\d,\d", text) and re.search(r"[\s;]", text)
+    return "." not in text and has_both is not None
 
 
-def check_length(path: Path, most: int, expected: str = "a text file") -> None:
+def check_text_length(path: Path, most: int, expected: str = "a text file") -> None:
     """Raise InputError for a text file of more than `most` bytes, or for something that is not a
     file.
     """
     check_file(path, expected)
     length = path.stat().st_size
     if length > most:
-        problem = (
-            f"found {length / 1e6:.1f} MB, expected a text file of at most {most / 1e6:.1f} MB"
+        raise InputError(
+            f"found {length / 1e6:.1f} MB, expected a text file of at most {most / 1e6:.1f} MB",
+            path,
         )
-        raise InputError(problem, path=path)
 
 
 def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file") -> bytes:
@@ -116,7 +116,7 @@ def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file
     check_file(path, expected, pipe=True)
     with reading(path):
         if not is_substitution(path):
-            check_length(path, most)
+            check_text_length(path, most)
             return path.read_bytes()
         if path not in _FROM_PIPES:
             with path.open("rb") as pipe:
@@ -124,7 +124,7 @@ def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file
             if len(content) > most:
                 size = f"{most / 1e6:.1f} MB"
                 raise InputError(
-                    f"found more than {size}, expected a text file of at most {size}", path=path
+                    f"found more than {size}, expected a text file of at most {size}", path
                 )
             _FROM_PIPES[path] = content
         return _FROM_PIPES[path]
@@ -145,14 +145,15 @@ def read_lines(
         text = content.decode("utf-16" if is_utf_16 else "utf-8-sig")
     except UnicodeDecodeError:
         if content.startswith((PNG, JPEG, *TIFF)):
-            raise InputError(f"found an image, expected {expected}", path=path) from None
+            raise InputError(f"found an image, expected {expected}", path) from None
         if not else_latin_1:
-            hint = "Save it as plain UTF-8 text"
-            raise InputError("the file is not UTF-8 text", path=path, hint=hint) from None
+            raise InputError(
+                "the file is not UTF-8 text", path, hint="Save it as plain UTF-8 text"
+            ) from None
         text = content.decode("latin-1")
     lines = re.split(r"\r\n|\r|\n", text)
     if len(lines) > most // 20:  # bytes of a line, on average: each line takes time and memory
-        raise InputError(f"found {len(lines)} lines, expected at most {most // 20}", path=path)
+        raise InputError(f"found {len(lines)} lines, expected at most {most // 20}", path)
     return lines
 
 
@@ -191,9 +192,9 @@ def parse_rows(rows: Sequence[WordRow], path: Path) -> NumberRows:
     no rows.
     """
     if not rows:
-        raise InputError("the file contains no numbers", path=path)
+        raise InputError("the file contains no numbers", path)
     parsed = (
-        Row(tuple(parse_number(word, path, line) for word in words), line, text)
+        NumberRow(tuple(parse_number(word, path, line) for word in words), line, text)
         for line, text, words in rows
     )
     return NumberRows(path, tuple(parsed))
@@ -203,11 +204,10 @@ def split_words(text: str, *, decimal_commas: bool = False) -> list[str]:
     """Return the words of a line, with points for decimal commas."""
     separators = _SEPARATORS_BESIDE_COMMAS if decimal_commas else _SEPARATORS
     words = [word for word in separators.split(text) if word]
-    if not decimal_commas:
-        return words
-    return [
-        word.replace(",", ".") if _NUMBER_WITH_COMMA.fullmatch(word) else word for word in words
-    ]
+    if decimal_commas:
+        is_number = _NUMBER_WITH_COMMA.fullmatch
+        return [word.replace(",", ".") if is_number(word) else word for word in words]
+    return words
 
 
 def uses_decimal_commas(texts: Sequence[str], n_numbers: int) -> bool:
@@ -237,7 +237,7 @@ def parse_number(word: str, path: Path, line: int) -> float:
     value = to_number(word)
     if value is None or not np.isfinite(value):
         what = "a number" if value is None else "a finite number"
-        raise InputError(f'found "{word[:40]}", expected {what}', path=path, line=line)
+        raise InputError(f'found "{word[:40]}", expected {what}', path, line=line)
     return value
 
 
@@ -290,11 +290,11 @@ def read_mat(path: Path, expected: ExpectedSize | None) -> Array:
         if variable is None:
             maps = {v.name: v for v in variables if len(v.shape) == 3 and v.shape[2] == 3}
             if len(maps) != 1:
-                problem = (
+                raise InputError(
                     "found no Normal_gt, and of other H x W x 3 arrays"
-                    f" {', '.join(maps) or 'none'}, expected one"
+                    f" {', '.join(maps) or 'none'}, expected one",
+                    path,
                 )
-                raise InputError(problem, path=path)
             (variable,) = maps.values()
         check_vectors(variable.shape, path)
         check_stored_size(variable.shape, 8, path, expected)
@@ -325,8 +325,11 @@ def _numbers(file: BinaryIO, variable: _Variable) -> Array:
 def _variables(file: BinaryIO, path: Path) -> Iterator[_Variable]:
     header = file.read(128)
     if header.startswith(b"MATLAB 7.3"):
-        hint = "Save it with MATLAB's option -v7"
-        raise InputError("found a MATLAB 7.3 file, which is not supported", path=path, hint=hint)
+        raise InputError(
+            "found a MATLAB 7.3 file, which is not supported",
+            path,
+            hint="Save it with MATLAB's option -v7",
+        )
     order = "<" if header[126:] == b"IM" else ">"
     for _ in range(10_000):
         if len(tag := file.read(_TAG_BYTES)) < _TAG_BYTES:

@@ -22,10 +22,10 @@ def solve_ia14(
     """Return normals (P, 3) from observations (P, F), at most 1, under lights (F, 3) or (P, F, 3);
     see fit.
     """
-    return fit(observations, light_directions, valid)[0]
+    return fit_ia14(observations, light_directions, valid)[0]
 
 
-def fit(
+def fit_ia14(
     observations: Tensor,
     light_directions: Tensor,
     valid: Tensor | None = None,

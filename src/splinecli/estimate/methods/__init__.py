@@ -109,8 +109,10 @@ def _network(
     loaded = resolve_weights(options.weights or weights)
     if loaded.network.config.interpolates != interpolates:
         kind, fitting = ("CNN-PS", "cnn-ps") if interpolates else ("SPLINE-Net", "spline-net")
-        problem = f"the weights {loaded.name!r} are for {kind}; the method {name} cannot use them"
-        raise ModelError(problem, hint=f"Use them with --method {fitting}")
+        raise ModelError(
+            f"the weights {loaded.name!r} are for {kind}; the method {name} cannot use them",
+            hint=f"Use them with --method {fitting}",
+        )
     return NetworkEstimator(
         name,
         loaded,
@@ -159,8 +161,8 @@ METHODS: dict[str, Method] = {
     ),
     "ia14": Method(
         partial(_fit, solve="ia14:solve_ia14", batch_size=1024),
-        "n.l as a monotone Bernstein polynomial of the observation and l.v; one quadratic"
-        " programme for each pixel",
+        "n.l as a monotone Bernstein polynomial of the observation and l.v;"
+        " one quadratic programme for each pixel",
         "Ikehata and Aizawa, CVPR 2014",
     ),
     "spline-net-pixelwise": Method(

@@ -6,12 +6,11 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from splinecli.errors import UsageError
 from splinecli.estimate.methods.estimator import (
@@ -28,9 +27,10 @@ from splinecli.estimate.networks.spline_net import Rotation
 from splinecli.estimate.networks.weights import LoadedNetwork, untrained_warning
 from splinecli.estimate.refinement.refiner import NetworkRefiner
 from splinecli.lights.lighting import LightingAt, PixelIndices, PixelLighting, PixelPlaces
-from splinecli.maths import Bools, Floats
+from splinecli.maths import Bools, Float32Array, Float64Array, Floats
 from splinecli.maths.observation_map import map_scale, rotate_about_view_axis, sparse_map
-from splinecli.system.machine import one_thread_each, side_by_side
+from splinecli.maths.pixel_grid import slices
+from splinecli.system.machine import NumberFormat, one_thread_each, side_by_side
 from splinecli.system.progress import Progress, ignore
 
 Solve = Callable[[Tensor, Tensor], Tensor]
@@ -41,13 +41,61 @@ The normals may have any length, 0 for a pixel that has none. All observations a
 is negative."""
 
 
-class BatchedEstimator(Estimator):
+_FEWEST_BATCHES, _FEWEST_AT_ONCE = 8, 256  # pixels; smaller batches take more time for each pixel
+
+
+class _InBatches(Estimator):
+    """An estimator that splits the pixels into batches of at most `batch_size`."""
+
+    batch_size: int
+    _dtype = torch.float32
+
+    def _solve_all(
+        self,
+        solve: Solve,
+        observations: Observations,
+        light_directions: Directions,
+        progress: Progress,
+        columns: int = 3,
+    ) -> Float32Array:
+        """Call `solve` on batches of observations, side by side, and return its results (P,
+        columns).
+
+        `solve` returns unit normals in the first three of its columns; zero vectors are replaced
+        with (0, 0, 1). It gets the observations (P, F) unscaled. `progress` is called after each
+        batch with the number of its pixels.
+        """
+        results = np.empty((len(observations), columns), np.float32)
+        size = self.batch_size
+        if self.device == "cpu":
+            # Few pixels make several smaller batches, whatever the number of cores, so that no core
+            # waits for another.
+            size = min(size, max(_FEWEST_AT_ONCE, -(-len(observations) // _FEWEST_BATCHES)))
+
+        def solve_batch(rows: slice) -> int:
+            batch, lights = (
+                torch.as_tensor(values, dtype=self._dtype, device=self.device)
+                for values in (observations[rows], directions_at(light_directions, rows))
+            )
+            solved = solve(batch, lights)
+            solved[~solved[:, :3].any(dim=1), :3] = solved.new_tensor(TOWARDS_CAMERA)
+            results[rows] = solved.cpu().numpy()
+            return len(batch)
+
+        for count in side_by_side(solve_batch, slices(len(observations), size)):
+            progress(count)
+        return results
+
+
+class BatchedEstimator(_InBatches):
     """An estimator that calls `solve` on batches of pixels, in float64.
 
     Each pixel is first divided by its largest observation. Thresholds and priors thus have the same
     meaning for dark and bright pixels, and the scale of the images does not matter. Raises
     UsageError for a batch size below 1.
     """
+
+    _dtype = torch.float64
 
     def __init__(self, name: str, solve: Solve, device: str, batch_size: int) -> None:
         if batch_size < 1:
@@ -61,7 +109,7 @@ class BatchedEstimator(Estimator):
         light_directions: Directions,
         *,
         progress: Progress = ignore,
-    ) -> NDArray[np.float32]:
+    ) -> Float32Array:
         """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3);
         see Estimator.
         """
@@ -72,63 +120,10 @@ class BatchedEstimator(Estimator):
             # The length may be tiny, and normalize would treat such a vector as zero. So divide in
             # two steps.
             largest = normals.abs().amax(dim=1, keepdim=True).clamp(min=1e-300)
-            return torch.nn.functional.normalize(normals / largest, dim=1)
+            return normalize(normals / largest, dim=1)
 
-        return estimate_in_batches(
-            solve_scaled,
-            observations,
-            light_directions,
-            batch_size=self.batch_size,
-            device=self.device,
-            dtype=torch.float64,
-            progress=progress,
-        )
+        return self._solve_all(solve_scaled, observations, light_directions, progress)
 
-
-_FEWEST_BATCHES, _FEWEST_AT_ONCE = 8, 256  # pixels; smaller batches take more time for each pixel
-
-
-def estimate_in_batches(
-    solve: Solve,
-    observations: Observations,
-    light_directions: Directions,
-    *,
-    batch_size: int,
-    device: str,
-    dtype: torch.dtype,
-    columns: int = 3,
-    progress: Progress = ignore,
-) -> NDArray[np.float32]:
-    """Call `solve` on batches of observations, side by side, and return its results (P, columns) as
-    float32.
-
-    `solve` returns unit normals in the first three of its columns; zero vectors are replaced by (0,
-    0, 1), and the other columns are not changed. It gets the observations (P, F) unscaled; the
-    light directions are (F, 3) or (P, F, 3). `progress` is called after each batch with the number
-    of its pixels.
-    """
-    results = np.empty((len(observations), columns), np.float32)
-    size = batch_size
-    if device == "cpu":
-        # Few pixels make several smaller batches, whatever the number of cores, so that no core
-        # waits for another.
-        size = min(size, max(_FEWEST_AT_ONCE, -(-len(observations) // _FEWEST_BATCHES)))
-
-    def solve_batch(start: int) -> int:
-        rows = slice(start, start + size)
-        batch = torch.as_tensor(observations[rows]).to(device, dtype)
-        lights = torch.as_tensor(directions_at(light_directions, rows), dtype=dtype, device=device)
-        solved = solve(batch, lights)
-        solved[~solved[:, :3].any(dim=1), :3] = solved.new_tensor(TOWARDS_CAMERA)
-        results[rows] = solved.cpu().numpy()
-        return len(batch)
-
-    for count in side_by_side(solve_batch, range(0, len(observations), size)):
-        progress(count)
-    return results
-
-
-Precision = Literal["float32", "bfloat16"]
 
 _CANDIDATES = 4096  # pixels from which the context of a capture is chosen
 _FEWEST_COVERED = 64  # with fewer fully covered candidates, all are used
@@ -204,7 +199,7 @@ either way.
 """
 
 
-class NetworkEstimator(Estimator):
+class NetworkEstimator(_InBatches):
     """LI-Net, then NE-Net (CNN-PS: NE-Net alone), on batches of pixels.
 
     `name` is the method's name in the registry, `precision` the number format of the convolutions,
@@ -219,7 +214,7 @@ class NetworkEstimator(Estimator):
         loaded: LoadedNetwork,
         *,
         device: torch.device | str = "cpu",
-        precision: Precision = "bfloat16",
+        precision: NumberFormat = "bfloat16",
         refines: bool = True,
         rotations: int = 1,
         batch_size: int = 1024,
@@ -232,11 +227,8 @@ class NetworkEstimator(Estimator):
         self.network = loaded.network.to(device)
         self.has_confidence = self.network.config.error_head
         refine_net = self.network.refine_net
-        self.refiner = (
-            NetworkRefiner(refine_net, self.precision)
-            if refines and refine_net is not None
-            else None
-        )
+        if refines and refine_net is not None:
+            self.refiner = NetworkRefiner(refine_net, self.precision)
         self.needs_capture = self.refiner is not None or self.network.config.sees_capture
         self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
         if self.network.config.sees_capture:
@@ -245,8 +237,8 @@ class NetworkEstimator(Estimator):
             self.fingerprint += f" with a context of up to {SAMPLE} pixels, outline {_COVERED}"
         if self.refiner is not None:
             self.fingerprint += (
-                f", without indirect light, refined in {self.refiner.turns} turns, halved, with"
-                " detail"
+                f", without indirect light, refined in {self.refiner.turns} turns, halved,"
+                " with detail"
             )
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
         self._contexts: list[CaptureContext | None] = [
@@ -281,7 +273,7 @@ class NetworkEstimator(Estimator):
         light_directions: Directions,
         *,
         progress: Progress = ignore,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    ) -> tuple[Float32Array, Float32Array]:
         """Estimate unit normals (P, 3) and the distributions (P, 2) of their errors; see Estimator.
 
         The numbers of the distributions are means over the rotations, and 0 without an error head.
@@ -293,15 +285,8 @@ class NetworkEstimator(Estimator):
 
             alone = self.bind(lighting_at, np.ones((1, len(observations)), np.bool_))
             return alone.estimate_with_error(observations, light_directions, progress=progress)
-        results = estimate_in_batches(
-            self._average_rotations,
-            observations,
-            light_directions,
-            batch_size=self.batch_size,
-            device=self.device,
-            dtype=torch.float32,
-            columns=5,
-            progress=progress,
+        results = self._solve_all(
+            self._average_rotations, observations, light_directions, progress, columns=5
         )
         return results[:, :3], results[:, 3:]
 
@@ -318,7 +303,7 @@ class NetworkEstimator(Estimator):
                 total[:, :3] += normals
                 if error is not None:
                     total[:, 3:] += error
-        unit = torch.nn.functional.normalize(total[:, :3], dim=-1)
+        unit = normalize(total[:, :3], dim=-1)
         averaged = torch.cat((unit, total[:, 3:] / len(self._rotations)), dim=1)
         dark = batch.amax(dim=1) <= 0
         averaged[dark] = averaged.new_tensor((0.0, 0.0, 0.0, *UNKNOWN_ERROR))
@@ -330,7 +315,7 @@ class NetworkEstimator(Estimator):
         observations: Observations,
         light_directions: Directions,
         all_observations: Observations,
-        all_directions: NDArray[np.float64],
+        all_directions: Float64Array,
     ) -> ObservationMaps | None:
         """Return the network's input, LI-Net's output, and the maps of all observations; see
         Estimator.
@@ -349,7 +334,7 @@ class NetworkEstimator(Estimator):
         values = all_seen / maps.scale
         every = sparse_map(values, turned, size=config.map_size, grid=config.grid)
 
-        def known(values: Tensor, occupied: Tensor) -> NDArray[np.float32]:
+        def known(values: Tensor, occupied: Tensor) -> Float32Array:
             return np.asarray(
                 values.masked_fill(occupied == 0, torch.nan)[:, 0].cpu().numpy(), np.float32
             )

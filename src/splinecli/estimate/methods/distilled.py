@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn.functional import linear, normalize
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from splinecli.errors import UsageError
 from splinecli.estimate.fits.least_squares import weighted_least_squares
 from splinecli.estimate.methods.estimator import (
-    FEWEST_PIXELS,
+    FEWEST_TO_DISTIL,
     TOWARDS_CAMERA,
     UNKNOWN_ERROR,
     Directions,
@@ -34,9 +34,10 @@ from splinecli.estimate.methods.estimator import (
 )
 from splinecli.estimate.networks.li_ne_net import median_error_deg
 from splinecli.lights.lighting import LightingAt
-from splinecli.maths import Bools
+from splinecli.maths import Bools, Float32Array
 from splinecli.maths.normals import angle_between_deg
 from splinecli.maths.observation_map import map_scale
+from splinecli.maths.pixel_grid import slices
 from splinecli.system.machine import one_thread_each, side_by_side
 from splinecli.system.progress import Progress, ignore
 
@@ -131,10 +132,7 @@ BATCH = 256
 _LEARNING_RATE = 1e-2
 _WARM_UP = 0.1  # share of the steps in which the learning rate rises
 # decay of the means of the gradient and of its square in Adam (arXiv 1412.6980)
-_MOMENTUM, _SQUARES = (
-    0.9,
-    0.99,
-)
+_MOMENTUM, _SQUARES = 0.9, 0.99
 _ERROR_SHARE = 0.05  # of the loss of the errors in the loss
 _ROUNDED = 0.02  # radians; the loss is the angle, but quadratic below this one
 
@@ -184,11 +182,9 @@ class Perceptron(nn.Module):
         """
         scaled = observations / map_scale(observations)
         if self.solve is not None:
-            return torch.cat((scaled, nn.functional.normalize(scaled @ self.solve, dim=1)), dim=1)
+            return torch.cat((scaled, normalize(scaled @ self.solve, dim=1)), dim=1)
         fitted, _ = weighted_least_squares(scaled, light_directions, torch.ones_like(scaled))
-        return torch.cat(
-            (scaled, light_directions.mean(dim=1), nn.functional.normalize(fitted, dim=1)), dim=1
-        )
+        return torch.cat((scaled, light_directions.mean(dim=1), normalize(fitted, dim=1)), dim=1)
 
     def forward(self, inputs: Tensor, *, bfloat16: bool = False) -> tuple[Tensor, Tensor]:
         """Return unit normals (P, 3) and the distributions of their errors (P, 2); see
@@ -202,7 +198,7 @@ class Perceptron(nn.Module):
             for layer in hidden:
                 scaled = layer(scaled).relu_()
         found = last(scaled.to(inputs.dtype))
-        return nn.functional.normalize(inputs[:, -3:] + found[:, :3], dim=1), found[:, 3:]
+        return normalize(inputs[:, -3:] + found[:, :3], dim=1), found[:, 3:]
 
     def gradient(self, inputs: Tensor, normals: Tensor, errors: Tensor) -> list[Tensor]:
         """Return the gradients of the loss, in the order of `parameters`.
@@ -215,8 +211,8 @@ class Perceptron(nn.Module):
         (*weights, last), (*biases, offset) = self._weights_and_biases()
         passed = [(inputs - self.mean) / self.spread]
         for weight, bias in zip(weights, biases, strict=True):
-            passed.append(nn.functional.linear(passed[-1], weight, bias).relu_())
-        found = nn.functional.linear(passed[-1], last, offset)
+            passed.append(linear(passed[-1], weight, bias).relu_())
+        found = linear(passed[-1], last, offset)
         corrected = inputs[:, -3:] + found[:, :3]
         length = corrected.norm(dim=1, keepdim=True).clamp_(min=1e-12)
         unit = corrected / length
@@ -266,12 +262,9 @@ class Perceptron(nn.Module):
             )
             mean.lerp_(gradient, 1 - _MOMENTUM)
             square.lerp_(gradient.square_(), 1 - _SQUARES)
-            rate = (
-                _LEARNING_RATE
-                * _rate_share(step / steps)
-                * math.sqrt(1 - _SQUARES**step)
-                / (1 - _MOMENTUM**step)
-            )
+            rate = _LEARNING_RATE * _rate_share(step / steps)
+            rate *= math.sqrt(1 - _SQUARES**step)
+            rate /= 1 - _MOMENTUM**step
             values.addcdiv_(mean, square.sqrt().add_(1e-8), value=-rate)
             progress()
 
@@ -291,7 +284,7 @@ _TILE = 8192  # with fewer pixels at once, two cores often wait for each other
 
 
 @dataclass(frozen=True)
-class Distillation:
+class DistilledFrom:
     """The learned perceptron, and how well it learned."""
 
     sample: int  # number of pixels that the network estimated for learning
@@ -326,17 +319,11 @@ class DistilledEstimator(Estimator):
         teacher: Estimator,
         perceptron: Perceptron,
         sample: PixelSample,
-        found: Distillation,
+        found: DistilledFrom,
         size: StudentSize,
     ) -> None:
-        self._teacher, self._perceptron, self._sample, self._size = (
-            teacher,
-            perceptron,
-            sample,
-            size,
-        )
-        self.distillation = found
-        self.n_unlike = 0
+        self._teacher, self._perceptron, self._sample = teacher, perceptron, sample
+        self._size, self.distillation, self.n_unlike = size, found, 0
         self.name, self.weights = teacher.name, teacher.weights
         self.refiner = teacher.refiner
         self.device, self.precision = teacher.device, teacher.precision
@@ -373,7 +360,7 @@ class DistilledEstimator(Estimator):
         light_directions: Directions,
         *,
         progress: Progress = ignore,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    ) -> tuple[Float32Array, Float32Array]:
         """Estimate unit normals (P, 3) and the distributions (P, 2) of the network's errors; see
         Estimator.
         """
@@ -394,8 +381,7 @@ class DistilledEstimator(Estimator):
             unlike[rows] = self._sample.unlike(inputs).cpu().numpy() & ~dark
             return rows
 
-        tiles = (slice(start, start + _TILE) for start in range(0, len(observations), _TILE))
-        for rows in side_by_side(apply, tiles):
+        for rows in side_by_side(apply, slices(len(observations), _TILE)):
             progress(int(np.count_nonzero(~unlike[rows])))
         if unlike.any():
             self.n_unlike += int(np.count_nonzero(unlike))
@@ -427,7 +413,7 @@ def distil(
     lit = np.flatnonzero((light.observations > 0).any(axis=1))
     candidates = light.observations[lit]
     directions = directions_at(light.directions, lit)
-    if len(candidates) // 2 < FEWEST_PIXELS:  # the sample is at most half of them
+    if len(candidates) // 2 < FEWEST_TO_DISTIL:  # the sample is at most half of them
         raise UsageError(f"{len(candidates)} pixels are lit, too few to distil the network")
     lights = torch.as_tensor(directions, dtype=torch.float32)
     perceptron = Perceptron(lights, size.width, generator).to(teacher.device)
@@ -462,9 +448,12 @@ def distil(
     with torch.inference_mode():
         learned, _ = perceptron(inputs[:held], bfloat16=teacher.precision == "bfloat16")
         angles = angle_between_deg(learned.cpu().numpy(), normals[:held].cpu().numpy())
-    mean_deg, p95_deg = float(angles.mean()), float(np.quantile(angles, 0.95))
-    found = Distillation(
-        len(inputs), held, mean_deg, p95_deg, float(median_error_deg(errors[:held]).mean())
+    found = DistilledFrom(
+        sample=len(inputs),
+        held_out=held,
+        mean_deg=float(angles.mean()),
+        p95_deg=float(np.quantile(angles, 0.95)),
+        expected_deg=float(median_error_deg(errors[:held]).mean()),
     )
     return DistilledEstimator(teacher, perceptron, sample, found, size)
 

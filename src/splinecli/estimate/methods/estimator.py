@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from splinecli.maths import Bools
+from splinecli.maths import Array, Bools, Float32Array, Float64Array, Floats
 from splinecli.maths.normals import unit
 from splinecli.maths.robust import solve_each
 from splinecli.system.progress import Progress, ignore
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from splinecli.maths.observation_map import Grid
 
 
-FEWEST_PIXELS = 64  # the smallest sample that can be learned from
+FEWEST_TO_DISTIL = 64  # the smallest sample that can be learned from
 
 
 @dataclass(frozen=True)
@@ -49,14 +48,14 @@ def student_sizes(n_pixels: int) -> tuple[StudentSize, StudentSize]:
     )
 
 
-Observations = NDArray[np.float32]  # (P, F): linear, already divided by the light intensities
+Observations = Float32Array  # (P, F): linear, already divided by the light intensities
 
 # (F, 3), or (P, F, 3) if near lamps give each pixel its own: unit vectors towards the lights; x
 # right, y up, z to the camera.
-Directions = NDArray[np.floating]
+Directions = Floats
 
 
-def directions_at(light_directions: Directions, pixels: slice | NDArray[Any]) -> Directions:
+def directions_at(light_directions: Directions, pixels: slice | Array) -> Directions:
     """Return the light directions of some pixels: those that all pixels share,
     or the pixels' own.
     """
@@ -98,7 +97,7 @@ class Estimator:
         light_directions: Directions,
         *,
         progress: Progress = ignore,
-    ) -> NDArray[np.floating]:
+    ) -> Floats:
         """Estimate unit normals (P, 3); x right, y up, z to the camera.
 
         A pixel that is dark under every light has no normal. It gets (0, 0, 1). The observations
@@ -114,7 +113,7 @@ class Estimator:
         light_directions: Directions,
         *,
         progress: Progress = ignore,
-    ) -> tuple[NDArray[np.floating], NDArray[np.floating] | None]:
+    ) -> tuple[Floats, Floats | None]:
         """Estimate normals (P, 3) as `estimate` does, and the distributions (P, 2) of their errors.
 
         The latter are None without confidence. networks/li_ne_net.py describes the two numbers. A
@@ -140,7 +139,7 @@ class Estimator:
         observations: Observations,
         light_directions: Directions,
         all_observations: Observations,
-        all_directions: NDArray[np.float64],
+        all_directions: Float64Array,
     ) -> ObservationMaps | None:
         """Return the observation maps of some pixels, or None for a method without them.
 
@@ -159,9 +158,9 @@ class ObservationMaps(NamedTuple):
     NaN in empty cells.
     """
 
-    sparse: NDArray[np.float32]  # the input of the network
-    dense: NDArray[np.float32]  # the output of LI-Net
-    every: NDArray[np.float32]  # of all lights
+    sparse: Float32Array  # the input of the network
+    dense: Float32Array  # the output of LI-Net
+    every: Float32Array  # of all lights
     grid: Grid
 
 
@@ -170,7 +169,7 @@ CONFIDENT_DEG = 5.0  # confidence is the probability that a normal is off by at 
 UNKNOWN_ERROR = (math.log(math.pi), math.log(30.0))  # of an unknown normal, whose confidence is 0
 
 
-def confidence(errors: NDArray[np.floating]) -> NDArray[np.float32]:
+def confident_share(errors: Floats) -> Float32Array:
     """Return the probability (P,) that an error is at most CONFIDENT_DEG, from its distributions
     (P, 2).
     """
@@ -199,7 +198,7 @@ class LeastSquares(Estimator):
         light_directions: Directions,
         *,
         progress: Progress = ignore,
-    ) -> NDArray[np.float64]:
+    ) -> Float64Array:
         """Estimate unit normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3);
         see Estimator.
         """
@@ -208,7 +207,7 @@ class LeastSquares(Estimator):
             scaled = values @ np.linalg.pinv(light_directions).T
         else:
             scaled = solve_each(values, light_directions)
-        normals: NDArray[np.float64] = unit(scaled)
+        normals: Float64Array = unit(scaled)
         normals[~scaled.any(axis=1)] = TOWARDS_CAMERA
         progress(len(normals))
         return normals

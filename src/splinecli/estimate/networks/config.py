@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import torch
 from msgspec import Meta
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from splinecli.errors import ModelError
 from splinecli.estimate.fits.ia14 import solve_ia14
@@ -55,7 +56,7 @@ def fit_normals(
     observed = torch.where(valid, observations, 0).clamp(min=0).double()
     lights = light_directions.double()
     found = torch.stack([STARTING_FITS[name](observed, lights, valid) for name in names], dim=1)
-    return torch.nn.functional.normalize(torch.nan_to_num(found), dim=-1).to(observations.dtype)
+    return normalize(torch.nan_to_num(found), dim=-1).to(observations.dtype)
 
 
 Depth = Annotated[int, Meta(ge=1, le=64)]  # each layer takes memory, whatever its size
@@ -112,8 +113,8 @@ class NetworkConfig:
         for fit in config.fits:
             if fit not in STARTING_FITS:
                 raise ModelError(
-                    f"network setting 'fits' has {fit!r}; expected a list of"
-                    f" {', '.join(STARTING_FITS)}"
+                    f"network setting 'fits' has {fit!r};"
+                    f" expected a list of {', '.join(STARTING_FITS)}"
                 )
         for name in ("fits", "error_head", "set_width"):
             if getattr(config, name) and config.size != "compact":
@@ -126,8 +127,8 @@ class NetworkConfig:
             raise ModelError("network setting 'sees_capture' needs 'set_width' above 0")
         if config.set_width % HEAD_WIDTH:
             raise ModelError(
-                f"network setting 'set_width' is {config.set_width}; expected a multiple of"
-                f" {HEAD_WIDTH}"
+                f"network setting 'set_width' is {config.set_width};"
+                f" expected a multiple of {HEAD_WIDTH}"
             )
         if config.grid != "even" and config.size != "paper":
             raise ModelError(

@@ -5,8 +5,10 @@ from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import linear, pixel_shuffle, pixel_unshuffle
 
 from splinecli.estimate.networks.config import NetworkConfig
+from splinecli.maths.pixel_grid import slices
 
 PATCH = 4  # side length in cells of the patches that an encoder combines into one position
 Layer = TypeVar("Layer", nn.Conv2d, nn.Linear)
@@ -41,7 +43,7 @@ class ResidualBlock(nn.Module):
         return change.add_(x) if change.dtype == x.dtype else x + change
 
 
-SIDE = 4  # patches along a side of the maps for which winograd_conv is written
+_SIDE = 4  # patches along a side of the maps for which winograd_conv is written
 _AT_ONCE = 256  # maps whose features stay in a processor's cache
 
 
@@ -71,18 +73,18 @@ def winograd_weights(weight: Tensor) -> Tensor:
 
 
 def winograd_conv(x: Tensor, transformed: Tensor, bias: Tensor | None) -> Tensor:
-    """Convolve maps (16, P, C) of SIDE x SIDE positions with `winograd_weights`, padded with zeros:
+    """Convolve maps (16, P, C) of 4 x 4 positions with `winograd_weights`, padded with zeros:
     (16, P, D).
 
     It takes 36 products for the 144 of a convolution, and each transform is one product of
     matrices.
     """
     _, n_maps, width = x.shape
-    values = (_OF_VALUES @ x.view(SIDE**2, -1)).view(-1, n_maps, width)
+    values = (_OF_VALUES @ x.view(_SIDE**2, -1)).view(-1, n_maps, width)
     products = torch.bmm(values, transformed)
     if bias is not None:
         products[7] += bias  # the transform adds this product to all positions, with a factor of 1
-    return (_OF_PRODUCTS @ products.view(len(products), -1)).view(SIDE**2, n_maps, -1)
+    return (_OF_PRODUCTS @ products.view(len(products), -1)).view(_SIDE**2, n_maps, -1)
 
 
 def is_float32(values: Tensor) -> bool:
@@ -109,36 +111,32 @@ class MapEncoder(nn.Module):
         self.blocks = nn.Sequential(*(ResidualBlock(width) for _ in range(blocks)))
 
     def forward(self, maps: Tensor) -> Tensor:
-        if maps.shape[-1] == SIDE * PATCH and not torch.is_grad_enabled() and is_float32(maps):
+        if maps.shape[-1] == _SIDE * PATCH and not torch.is_grad_enabled() and is_float32(maps):
             return self._few_products(maps)
-        patches = nn.functional.pixel_unshuffle(maps, PATCH).contiguous(
-            memory_format=torch.channels_last
-        )
+        patches = pixel_unshuffle(maps, PATCH).contiguous(memory_format=torch.channels_last)
         features: Tensor = self.blocks(self.patches(patches) + self.position)
         return features
 
     def _few_products(self, maps: Tensor) -> Tensor:
-        """Return the same features of maps of SIDE x SIDE patches by Winograd's algorithm, in half
+        """Return the same features of maps of 4 x 4 patches by Winograd's algorithm, in half
         of the time.
         """
         convolutions = [layer for layer in self.blocks.modules() if isinstance(layer, nn.Conv2d)]
         layers = [(winograd_weights(layer.weight), layer.bias) for layer in convolutions]
         position = self.position.flatten(2).permute(2, 0, 1)
-        found = maps.new_empty(len(maps), SIDE**2, self.position.shape[1])
-        for start in range(0, len(maps), _AT_ONCE):
+        found = maps.new_empty(len(maps), _SIDE**2, self.position.shape[1])
+        for part in slices(len(maps), _AT_ONCE):
             # (P, C, rows, y, columns, x) to (rows, columns, P, C, y, x)
-            split = maps[start : start + _AT_ONCE].view(-1, maps.shape[1], SIDE, PATCH, SIDE, PATCH)
-            patches = split.permute(2, 4, 0, 1, 3, 5).reshape(SIDE**2, -1, self.patches.in_channels)
-            x = (
-                nn.functional.linear(patches, self.patches.weight.flatten(1), self.patches.bias)
-                + position
+            split = maps[part].view(-1, maps.shape[1], _SIDE, PATCH, _SIDE, PATCH)
+            patches = split.permute(2, 4, 0, 1, 3, 5).reshape(
+                _SIDE**2, -1, self.patches.in_channels
             )
-            for first, second in zip(
-                layers[::2], layers[1::2], strict=True
-            ):  # of each residual block
+            x = linear(patches, self.patches.weight.flatten(1), self.patches.bias) + position
+            # of each residual block
+            for first, second in zip(layers[::2], layers[1::2], strict=True):
                 x = winograd_conv(winograd_conv(x.relu(), *first).relu_(), *second).add_(x)
-            found[start : start + _AT_ONCE] = x.transpose(0, 1)
-        return found.transpose(1, 2).view(-1, self.position.shape[1], SIDE, SIDE)
+            found[part] = x.transpose(0, 1)
+        return found.transpose(1, 2).view(-1, self.position.shape[1], _SIDE, _SIDE)
 
 
 HIDDEN = 64
@@ -148,7 +146,7 @@ class ErrorHead(nn.Module):
     """Estimates a log-logistic distribution of the error (P, 2) from NE-Net's hidden features and
     its normals.
 
-    The first number is the logarithm of the median error in radians, with _MORE_DEG added. The
+    The first number is the logarithm of the median error in radians, with MORE_DEG added. The
     second is the logarithm of the distribution's shape: a larger shape means a narrower
     distribution. The other layers are fixed while the head is trained, so it does not change the
     normals.
@@ -171,27 +169,18 @@ class ErrorHead(nn.Module):
 
 
 # Added to all errors. Otherwise the logarithm would emphasise differences between tiny errors.
-_MORE_DEG = 0.1
-
-
-def error_negative_log_likelihood(error: Tensor, angle: Tensor) -> Tensor:
-    """Return the negative log-likelihood (P,) of the logs of errors (P,), in radians, under
-    distributions (P, 2).
-    """
-    median, shape = error.unbind(-1)
-    z = shape.exp() * ((angle + math.radians(_MORE_DEG)).log() - median)
-    return z + 2 * nn.functional.softplus(-z) - shape
+MORE_DEG = 0.1
 
 
 def probability_within(error: Tensor, limit_deg: float) -> Tensor:
     """Return the probability (P,) that the error is at most limit_deg."""
     median, shape = error.unbind(-1)
-    return torch.sigmoid(shape.exp() * (math.log(math.radians(limit_deg + _MORE_DEG)) - median))
+    return torch.sigmoid(shape.exp() * (math.log(math.radians(limit_deg + MORE_DEG)) - median))
 
 
 def median_error_deg(error: Tensor) -> Tensor:
     """Return the medians (P,) of distributions (P, 2) in degrees."""
-    return error[:, 0].exp().rad2deg() - _MORE_DEG
+    return error[:, 0].exp().rad2deg() - MORE_DEG
 
 
 PIXEL_FEATURES, CAPTURE_FEATURES = 2, 20  # numbers of features from confidence.py
@@ -224,9 +213,8 @@ class CaptureHead(nn.Module):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
         with torch.no_grad():
-            self.linear.bias[
-                1
-            ] = -3.5  # initial value of the logarithm of the median error in radians
+            # initial value of the logarithm of the median error in radians
+            self.linear.bias[1] = -3.5
 
     def forward(self, errors: Tensor, pixels: Tensor, capture: Tensor) -> Tensor:
         """Return the adjusted distributions (P, 2) of the errors (P, 2), from features of the
@@ -305,7 +293,7 @@ class CompactLINet(nn.Module):
         self.decoder = zeroed(nn.Conv2d(config.width, PATCH**2, 1))
 
     def forward(self, maps: Tensor) -> Tensor:
-        return nn.functional.pixel_shuffle(self.decoder(torch.relu(self.encoder(maps))), PATCH)
+        return pixel_shuffle(self.decoder(torch.relu(self.encoder(maps))), PATCH)
 
 
 DROPOUT = 0.2  # share of the channels dropped in training at the paper size
@@ -385,9 +373,9 @@ class CompactNENet(nn.Module):
             nn.init.zeros_(self.weigh.weight)
             with torch.no_grad():
                 self.weigh.bias.zero_()[0] = 1
-        self.join = (
-            nn.Linear(config.set_width, head_width, bias=False) if config.set_width else None
-        )
+        self.join: nn.Linear | None = None
+        if config.set_width:
+            self.join = nn.Linear(config.set_width, head_width, bias=False)
         self.error_head = ErrorHead(head_width, fits + 2) if config.error_head else None
 
     def forward(

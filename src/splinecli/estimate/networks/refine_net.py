@@ -46,7 +46,7 @@ def channels(name: str) -> slice:
     return slice(start, start + FEATURE_WIDTHS[name])
 
 
-CHANNELS = sum(FEATURE_WIDTHS.values())
+FEATURE_CHANNELS = sum(FEATURE_WIDTHS.values())
 READ = channels("noise").start  # number of channels read by the net
 # Channels with the x and y components of vectors, which rotate with the image.
 VECTORS = tuple(
@@ -89,14 +89,10 @@ def with_refined(features: Tensor, normals: Tensor, error: Tensor) -> Tensor:
 
 WIDTHS = (32, 64, 96, 64)  # channels at full, half, quarter and eighth resolution
 # widths in pixels of smoothed normals, which the net weights against the estimated normal
-SIGMAS = (
-    0.7,
-    1.5,
-    3.0,
-)
+SIGMAS = (0.7, 1.5, 3.0)
 # Side of a pixel at the coarsest scale. Tile origins are multiples of COARSEST.
 COARSEST = 2 ** (len(WIDTHS) - 1)
-Part = tuple[slice, slice]  # rows and columns of a map
+Box = tuple[slice, slice]  # rows and columns of a map
 
 
 class RefineNet(nn.Module):
@@ -135,7 +131,7 @@ class RefineNet(nn.Module):
         self.reach = 96 * (1 + twice)  # 96 per net
 
     def forward(
-        self, features: Tensor, mask: Tensor, inner: Part | None = None
+        self, features: Tensor, mask: Tensor, inner: Box | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return unit normals (B, 3, h, w) and errors (B, 2, h, w), zero outside a mask (B, 1, H,
         W) of 1 and 0.
@@ -150,18 +146,16 @@ class RefineNet(nn.Module):
             return found
         return self._correct(features, mask, inner)
 
-    def _correct(self, features: Tensor, mask: Tensor, inner: Part | None) -> tuple[Tensor, Tensor]:
+    def _correct(self, features: Tensor, mask: Tensor, inner: Box | None) -> tuple[Tensor, Tensor]:
         height, width = mask.shape[-2:]
         rows, columns = (slice(None), slice(None)) if inner is None else inner
         inner = slice(*rows.indices(height)[:2]), slice(*columns.indices(width)[:2])
         border = (0, -width % COARSEST, 0, -height % COARSEST)
         # The data type of the layers. In training, the sums over the blocks stay in float32.
         device = features.device.type
-        layers = (
-            torch.get_autocast_dtype(device)
-            if torch.is_autocast_enabled(device)
-            else features.dtype
-        )
+        layers = features.dtype
+        if torch.is_autocast_enabled(device):
+            layers = torch.get_autocast_dtype(device)
         stream = features.dtype if torch.is_grad_enabled() else layers
         masks = [pad(mask, border).to(layers)]
         for _ in self.down:
@@ -222,7 +216,7 @@ def _joined(maps: Sequence[Tensor], border: tuple[int, ...], dtype: torch.dtype)
     return joined
 
 
-def _grown(part: Part, margin: int) -> Part:
+def _grown(part: Box, margin: int) -> Box:
     """Return a part with a margin, expanded to whole pixels of the coarsest scale. It may extend
     past the map.
     """
@@ -233,7 +227,7 @@ def _grown(part: Part, margin: int) -> Part:
     return rows, columns
 
 
-def _cells(part: Part, origin: tuple[int, int], scale: int) -> tuple[EllipsisType, slice, slice]:
+def _cells(part: Box, origin: tuple[int, int], scale: int) -> tuple[EllipsisType, slice, slice]:
     """Return the index of a part in a map of the given scale that begins at the pixel `origin`."""
     rows, columns = (
         slice(side.start - start >> scale, side.stop - start >> scale)

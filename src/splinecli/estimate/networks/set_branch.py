@@ -13,10 +13,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn.functional import normalize, scaled_dot_product_attention
 
 from splinecli.estimate.fits.least_squares import direction_products, weighted_sum
 from splinecli.estimate.networks.config import HEAD_WIDTH
 from splinecli.estimate.networks.li_ne_net import zeroed
+from splinecli.maths import Floats
 from splinecli.maths.robust import inverse_3x3, lit_values, multiply_symmetric
 
 SAMPLE = 512  # number of pixels of a capture that all its pixels attend to
@@ -37,6 +39,17 @@ class CaptureContext(NamedTuple):
     layers: tuple[Summary, ...]  # one for each layer of the set branch
 
 
+class ScaledPixels(NamedTuple):
+    """The inputs of the set branch: P pixels, each divided by its largest observation."""
+
+    observed: Tensor  # (P, F)
+    lights: Tensor  # (P, F, 3), unit, in the pixels' frames
+    residuals: Tensor  # (P, F), of the robust Lambertian fit
+    valid: Tensor | None  # (P, F) bool, or None for all
+    normals: Tensor  # (P, K, 3), the starting normals, unit or zero
+    scale: Tensor  # (P, 1), the largest observations
+
+
 class PixelTokens(NamedTuple):
     """The tokens of P pixels, and the numbers that they are relative to; see
     SplineNet.encode_pixels.
@@ -48,7 +61,7 @@ class PixelTokens(NamedTuple):
     n_lights: Tensor  # (P, 1), the number of lights
 
 
-def sample_of(observations: NDArray[np.floating]) -> NDArray[np.intp]:
+def sample_of(observations: Floats) -> NDArray[np.intp]:
     """Choose the sample of pixels that all pixels of a capture attend to, and return their rows in
     (P, F).
 
@@ -97,21 +110,15 @@ class ContextLayer(nn.Module):
         `known` is the summary of one capture; None uses the pixels themselves as the samples of
         their captures.
         """
-        embedded = (
-            self.embed(torch.cat((tokens, level), dim=1))
-            .view(-1, captures, tokens.shape[1])
-            .transpose(0, 1)
-        )
+        embedded = self.embed(torch.cat((tokens, level), dim=1))
+        embedded = embedded.view(-1, captures, tokens.shape[1]).transpose(0, 1)
         summary = self._summarise(embedded) if known is None else known
         queries = self.query_norm(embedded)
         with torch.autocast(tokens.device.type, enabled=False):
             # Use float32, as in the set branch.
-            parts = (
-                _split(self.queries(queries.to(self.queries.weight.dtype))),
-                summary.keys,
-                summary.values,
-            )
-            found = nn.functional.scaled_dot_product_attention(*parts).transpose(1, 2).flatten(2)
+            asked = _split(self.queries(queries.to(self.queries.weight.dtype)))
+            found = scaled_dot_product_attention(asked, summary.keys, summary.values)
+            found = found.transpose(1, 2).flatten(2)
         seen = torch.cat(
             (queries, found.to(queries), summary.mean.to(queries).expand_as(queries)), dim=2
         )
@@ -157,27 +164,16 @@ class SetBranch(nn.Module):
         self.weigh = zeroed(nn.Linear(width, 2))
 
     def forward(
-        self,
-        observed: Tensor,
-        lights: Tensor,
-        residual: Tensor,
-        valid: Tensor | None,
-        normals: Tensor,
-        scale: Tensor,
-        *,
-        captures: int = 1,
-        context: CaptureContext | None = None,
+        self, pixels: ScaledPixels, captures: int = 1, context: CaptureContext | None = None
     ) -> tuple[Tensor, Tensor, CaptureContext | None]:
         """Return the pixels' tokens (P, width), the unit normals (P, 3) of least squares, and the
         captures' context.
 
-        The observed values and residuals (P, F) of each pixel are divided by its largest
-        observation, `scale` (P, 1). The lights (P, F, 3) are unit, in the pixels' frames, `valid`
-        (P, F) is None for all, and the starting normals (P, K, 3) are unit or zero. Pixel p belongs
-        to capture p % `captures`. Without a context, the pixels of each capture attend to each
-        other.
+        Pixel p belongs to capture p % `captures`. Without a context, the pixels of each capture
+        attend to each other.
         """
-        half = nn.functional.normalize(lights + lights.new_tensor((0.0, 0.0, 1.0)), dim=-1)
+        observed, lights, residual, valid, normals, scale = pixels
+        half = normalize(lights + lights.new_tensor((0.0, 0.0, 1.0)), dim=-1)
         log_observed = (observed.clamp(min=0) + 1e-3).log()  # the offset keeps the logarithm finite
         values = torch.stack((observed, log_observed, residual), dim=-1)
         features = torch.cat((lights, values, lights @ normals.mT, half @ normals.mT), dim=-1)
@@ -240,9 +236,7 @@ class _AttentionLayer(nn.Module):
             # to six times.
             queries, keys, values = queries.float(), keys.float(), values.float()
         with torch.autocast(tokens.device.type, enabled=False):
-            attended = nn.functional.scaled_dot_product_attention(
-                queries, keys, values, attn_mask=mask
-            )
+            attended = scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
         tokens = tokens + self.attended(attended.transpose(1, 2).reshape(pixels, count, width))
         out: Tensor = tokens + self.perceptron(self.norm2(tokens))
         return out
@@ -256,4 +250,4 @@ def _weighted_normals(targets: Tensor, lights: Tensor, weight: Tensor) -> Tensor
     # If otherwise undetermined, the normal points to the camera.
     vector = weighted_sum(weight * targets, lights) + lights.new_tensor((0, 0, 1e-2 * _PRIOR))
     scaled = multiply_symmetric(inverse_3x3(matrix.unbind(-1), 1e-6), vector.unbind(-1))
-    return nn.functional.normalize(torch.stack(scaled, dim=-1), dim=-1)
+    return normalize(torch.stack(scaled, dim=-1), dim=-1)

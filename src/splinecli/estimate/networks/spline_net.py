@@ -11,12 +11,18 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import normalize
 
 from splinecli.estimate.fits.least_squares import fit_lambertian
 from splinecli.estimate.networks.config import NetworkConfig, fit_normals
 from splinecli.estimate.networks.li_ne_net import CompactLINet, CompactNENet, PaperLINet, PaperNENet
 from splinecli.estimate.networks.refine_net import RefineNet
-from splinecli.estimate.networks.set_branch import CaptureContext, PixelTokens, SetBranch
+from splinecli.estimate.networks.set_branch import (
+    CaptureContext,
+    PixelTokens,
+    ScaledPixels,
+    SetBranch,
+)
 from splinecli.maths.observation_map import (
     cell_directions,
     map_scale,
@@ -129,9 +135,8 @@ class SplineNet(nn.Module):
         # normal.
         z = torch.maximum(z, 0.02 * torch.hypot(x, y))
         azimuth = torch.atan2(y, x) if self.config.is_canonical else torch.zeros_like(x)
-        angle = (
-            torch.as_tensor(rotation.turn_deg, device=azimuth.device) * (math.pi / 180) - azimuth
-        )
+        turn_deg = torch.as_tensor(rotation.turn_deg, device=azimuth.device)
+        angle = turn_deg * (math.pi / 180) - azimuth
         cosine, sine = angle.cos(), angle.sin()
         lights = rotate_about_view_axis(
             light_directions.expand(*observed.shape, 3), cosine[:, None], sine[:, None]
@@ -175,10 +180,7 @@ class SplineNet(nn.Module):
         if self.config.size == "paper":
             dense: Tensor = self.li_net(maps.sparse)
         else:
-            inputs = torch.cat(
-                (maps.sparse, maps.occupied, maps.residual, maps.lambertian_map), dim=1
-            )
-            dense = maps.lambertian_map + self.li_net(inputs)
+            dense = maps.lambertian_map + self.li_net(torch.cat(maps[:4], dim=1))
         return dense * self.inside
 
     def estimate(
@@ -199,15 +201,13 @@ class SplineNet(nn.Module):
         if self.config.size == "paper":
             raw, error = self.ne_net(torch.cat((maps.sparse, *interpolated), dim=1)), None
         else:
-            channels = (maps.sparse, maps.occupied, maps.residual, maps.lambertian_map)
             normals, features = _starting_normals(maps), None
             if self.set_branch is not None:
                 features, fitted, _ = self._read_set(maps, normals, captures, context)
                 normals = torch.cat((normals, fitted[:, None]), dim=1)
-            raw, error = self.ne_net(
-                torch.cat((*channels, *interpolated), dim=1), normals, features
-            )
-        return Estimate(nn.functional.normalize(raw.float(), dim=-1), error)
+            channels = torch.cat((*maps[:4], *interpolated), dim=1)
+            raw, error = self.ne_net(channels, normals, features)
+        return Estimate(normalize(raw.float(), dim=-1), error)
 
     def forward(
         self,
@@ -261,19 +261,19 @@ class SplineNet(nn.Module):
         with torch.autocast(observations.device.type, enabled=False):
             maps = self.build_maps(observations, light_directions, valid, rotation)
         tokens, fitted, found = self._read_set(maps, _starting_normals(maps), captures, context)
-        count = (
-            torch.full_like(maps.scale, observations.shape[1])
-            if valid is None
-            else valid.sum(1, keepdim=True)
-        )
-        return PixelTokens(tokens.float(), fitted[:, 2:], maps.scale, count.to(maps.scale)), found
+        count = torch.full_like(maps.scale, observations.shape[1])
+        if valid is not None:
+            count = valid.sum(1, keepdim=True).to(count)
+        return PixelTokens(tokens.float(), fitted[:, 2:], maps.scale, count), found
 
     def _read_set(
         self, maps: PixelMaps, normals: Tensor, captures: int, context: CaptureContext | None
     ) -> tuple[Tensor, Tensor, CaptureContext | None]:
         assert self.set_branch is not None
-        inputs = maps.observed, maps.lights, maps.residuals, maps.valid, normals, maps.scale
-        return self.set_branch(*inputs, captures=captures, context=context)  # type: ignore[no-any-return]
+        pixels = ScaledPixels(
+            maps.observed, maps.lights, maps.residuals, maps.valid, normals, maps.scale
+        )
+        return self.set_branch(pixels, captures, context)  # type: ignore[no-any-return]
 
 
 def _starting_normals(maps: PixelMaps) -> Tensor:
@@ -285,9 +285,3 @@ def to_capture_frame(normals: Tensor, maps: PixelMaps) -> Tensor:
     if maps.mirrored:
         normals = normals * normals.new_tensor((1.0, -1.0, 1.0))
     return rotate_about_view_axis(normals, maps.cosine, -maps.sine)
-
-
-def to_pixel_frame(vectors: Tensor, maps: PixelMaps) -> Tensor:
-    """Rotate vectors (P, 3) from the capture's frame into the pixels' frames."""
-    turned = rotate_about_view_axis(vectors, maps.cosine, maps.sine)
-    return turned * turned.new_tensor((1.0, -1.0, 1.0)) if maps.mirrored else turned

@@ -23,10 +23,9 @@ from splinecli.system.weight_files import (
     load_strictly,
     read_json_entry,
     read_tensors,
-    save_module,
 )
 
-FORMAT = "splinecli-weights-1"
+WEIGHTS_FORMAT = "splinecli-weights-1"
 HEAD_FORMAT = "splinecli-capture-head-1"
 
 
@@ -39,12 +38,6 @@ class LoadedNetwork:
     sha256: str  # SHA-256 of the weight file
 
 
-def save_weights(network: SplineNet, path: Path) -> None:
-    """Write the parameters of a network as float16, with its configuration. Raises OutputError."""
-    config = json.dumps(network.config.to_dict(), sort_keys=True)
-    save_module(network, path, {"format": FORMAT, "config": config})
-
-
 def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
     """Load the network in a weight file, named `name` or after the file without its suffix. Raises
     ModelError.
@@ -52,19 +45,17 @@ def load_weights(path: Path, *, name: str | None = None) -> LoadedNetwork:
     names = ", ".join(shipped_names())
     writers = "'splinecli train' or 'splinecli import-weights'"
     hint = f"--weights takes a file written by {writers}, or one of the names {names}"
-    tensors, metadata = read_tensors(path, FORMAT, hint)
+    tensors, metadata = read_tensors(path, WEIGHTS_FORMAT, hint)
     config = NetworkConfig.from_dict(read_json_entry(metadata, "config", path))
-    with torch.device(
-        "meta"
-    ):  # allocates no memory, because the configuration may request any size
-        load_strictly(
-            SplineNet(config), {key: tensor.to("meta") for key, tensor in tensors.items()}, path
-        )
+    # This allocates no memory, because the configuration may request any size.
+    with torch.device("meta"):
+        sizes = {key: tensor.to("meta") for key, tensor in tensors.items()}
+        load_strictly(SplineNet(config), sizes, path)
     network = SplineNet(config)
     load_strictly(network, tensors, path)
     for key, tensor in tensors.items():
         if not torch.isfinite(tensor).all():
-            raise ModelError(f"tensor {key!r} has values that are not finite", path=path)
+            raise ModelError(f"tensor {key!r} has values that are not finite", path)
     network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return LoadedNetwork(network, name or path.stem, file_sha256(path))
 
@@ -107,8 +98,8 @@ def resolve_weights(name_or_file: str) -> LoadedNetwork:
         if path.suffix != ".safetensors" and path.parent == Path() and not os.path.exists(path):  # noqa: PTH110
             names = ", ".join(shipped_names())
             raise ModelError(
-                f"no weights named {name_or_file!r}; expected one of {names}, or a .safetensors"
-                " file"
+                f"no weights named {name_or_file!r}; expected one of {names},"
+                " or a .safetensors file"
             )
         return load_weights(path)
     with resources.as_file(SHIPPED / entry["file"]) as path:

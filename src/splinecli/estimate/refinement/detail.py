@@ -10,21 +10,20 @@ A capture at half the resolution, and its results at the full one.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, interpolate
 
-from splinecli.estimate.networks.refine_net import gaussian_sum, reach_of, unit_maps
-from splinecli.estimate.refinement.tiles import Box, pixels_before
+from splinecli.estimate.networks.refine_net import Box, gaussian_sum, reach_of, unit_maps
+from splinecli.estimate.refinement.tiles import pixels_before
 from splinecli.lights.lighting import LIT_AT_ONCE, LightingAt, PixelIndices, PixelLighting
+from splinecli.maths import Array, Bools, Float32Array
 from splinecli.maths.normals import unit
+from splinecli.maths.pixel_grid import on_map
 from splinecli.system.machine import side_by_side
 
-Floats = NDArray[np.float32]
 # weight of a pixel that is dark under every light, relative to lit ones of the capture's brightness
 _DARK = 1e-6
 
@@ -35,10 +34,10 @@ class HalfCapture:
     another capture.
     """
 
-    mask: NDArray[np.bool_]  # (H / 2, W / 2), with Q true pixels
-    observations: Floats  # (Q, F)
-    normals: Floats  # (Q, 3), unit, in the capture's frame
-    errors: Floats  # (Q, 2)
+    mask: Bools  # (H / 2, W / 2), with Q true pixels
+    observations: Float32Array  # (Q, F)
+    normals: Float32Array  # (Q, 3), unit, in the capture's frame
+    errors: Float32Array  # (Q, 2)
     # (Q,), the row in the other capture of one pixel of each block, whose lights hold for it
     members: PixelIndices
     whole: LightingAt  # gives the light of the other capture's pixels
@@ -46,10 +45,10 @@ class HalfCapture:
     @classmethod
     def of(
         cls,
-        mask: NDArray[np.bool_],
+        mask: Bools,
         lighting_at: LightingAt,
-        normals: Floats,
-        errors: Floats,
+        normals: Float32Array,
+        errors: Float32Array,
         reference: float,
     ) -> HalfCapture:
         """Return half of a capture with a mask (H, W), both even, of P true pixels, and the
@@ -80,17 +79,12 @@ class HalfCapture:
             weights = np.maximum(largest, np.float32(_DARK * reference))
             found = np.hstack((normals[rows], errors[rows])) * weights
             sent = np.hstack((observations * equal, equal, found, weights))
-            maps, numbers = (
-                np.zeros((*seen.shape, sent.shape[1]), np.float32),
-                np.zeros(seen.shape, np.int32),
-            )
-            maps[seen], numbers[seen] = sent, rows
-            sums = _over_blocks(np.add, maps)[kept]
+            sums = _over_blocks(np.add, on_map(sent, seen))[kept]
             done = slice(done_above[first], done_above[last])
             small.observations[done] = sums[:, :-7] / sums[:, -7:-6]
             small.normals[done] = unit(sums[:, -6:-3])
             small.errors[done] = sums[:, -3:-1] / sums[:, -1:]
-            small.members[done] = _over_blocks(np.maximum, numbers)[kept]
+            small.members[done] = _over_blocks(np.maximum, on_map(rows, seen))[kept]
 
         for _ in side_by_side(halve, range(0, len(half), step)):
             pass
@@ -113,10 +107,11 @@ class HalfCapture:
             np.count_nonzero(self.mask[: rows.start]) - 1
         )
         mask, numbers = mask[:, columns], numbers[:, columns]
-        values = np.zeros((*mask.shape, 5), np.float32)
         some = numbers[mask]
-        values[mask] = np.hstack((self.normals[some], self.errors[some]))
-        maps = enlarge(torch.from_numpy(values).permute(2, 0, 1), torch.from_numpy(mask))
+        values = np.hstack((self.normals[some], self.errors[some]))
+        maps = enlarge(
+            torch.from_numpy(on_map(values, mask)).permute(2, 0, 1), torch.from_numpy(mask)
+        )
         top, left = box[0].start - 2 * rows.start, box[1].start - 2 * columns.start
         maps = maps[
             :, top : top + box[0].stop - box[0].start, left : left + box[1].stop - box[1].start
@@ -130,11 +125,11 @@ def enlarge(maps: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     """
     weights = mask.to(maps)[None]
     weighed = torch.cat((maps * weights, weights))[None]
-    found = torch.nn.functional.interpolate(weighed, scale_factor=2, mode="bilinear")[0]
+    found = interpolate(weighed, scale_factor=2, mode="bilinear")[0]
     return found[:-1] / found[-1:].clamp(min=1e-6)
 
 
-def _over_blocks(function: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
+def _over_blocks(function: np.ufunc, values: Array) -> Array:
     """Return a function of the four values (H, W, ...) in each block of 2 x 2, (H / 2, W / 2,
     ...).
     """
@@ -144,8 +139,8 @@ def _over_blocks(function: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
 
 FINE = 1.5  # detail is the part that a Gaussian filter with this sigma in pixels removes
 WINDOW = 3.0  # detail is compared in a Gaussian window with this sigma in pixels
-REACH = reach_of(FINE) + reach_of(WINDOW)  # no pixel further away than this changes a result
-FEWEST_LIGHTS = 6  # fewer have no residuals, or hardly any, and so do not show noise well
+DETAIL_REACH = reach_of(FINE) + reach_of(WINDOW)  # no pixel further away than this changes a result
+FEWEST_FOR_DETAIL = 6  # fewer have no residuals, or hardly any, and so do not show noise well
 _TINY = 1e-12
 
 

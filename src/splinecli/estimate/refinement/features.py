@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from splinecli.estimate.fits import least_squares
 from splinecli.estimate.fits.least_squares import TwoHalves, weighted_sum
@@ -38,9 +39,7 @@ def refine_features(
     scale = map_scale(observations)
     observed = observations / scale
     count = observed.shape[1]
-    robust = torch.nn.functional.normalize(
-        least_squares.fit_lambertian(observed, light_directions), dim=-1
-    )
+    robust = normalize(least_squares.fit_lambertian(observed, light_directions), dim=-1)
     plain, change, noise = two_halves(observed, light_directions, signs)
     cosine = dot(normals, light_directions).clamp_(min=0)
     # Products with ones are faster than sums over so few columns.
@@ -87,7 +86,7 @@ def brightness(observations: Tensor) -> float:
     return max(float(observations.amax(dim=1).median()), 1e-12)
 
 
-class Turn(NamedTuple):
+class MapTurn(NamedTuple):
     """A mirror image (x is flipped) if `mirror`, then `quarters` counterclockwise rotations by 90
     degrees.
     """
@@ -96,19 +95,19 @@ class Turn(NamedTuple):
     mirror: bool = False
 
     @property
-    def back(self) -> Turn:
+    def back(self) -> MapTurn:
         """The rotation that undoes this one. A rotated mirror image undoes itself."""
-        return self if self.mirror else Turn(-self.quarters % 4)
+        return self if self.mirror else MapTurn(-self.quarters % 4)
 
 
-def turn_features(features: Tensor, turn: Turn) -> Tensor:
+def turn_features(features: Tensor, turn: MapTurn) -> Tensor:
     """Rotate maps of features (..., CHANNELS, H, W)."""
     return turn_maps(features, turn, VECTORS, (TENSOR,))
 
 
 def turn_maps(
     maps: Tensor,
-    turn: Turn,
+    turn: MapTurn,
     vectors: Sequence[tuple[int, int]] = (),
     tensors: Sequence[tuple[int, int, int]] = (),
 ) -> Tensor:

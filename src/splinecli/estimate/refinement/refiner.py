@@ -9,31 +9,29 @@ detail that is real; see detail.py.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass
-from typing import Any
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from splinecli.estimate.fits.least_squares import alternating_signs
 from splinecli.estimate.networks.refine_net import (
-    CHANNELS,
     COARSEST,
-    Part,
+    FEATURE_CHANNELS,
+    Box,
     RefineNet,
     channels,
     unit_maps,
 )
 from splinecli.estimate.refinement.detail import (
-    FEWEST_LIGHTS,
+    DETAIL_REACH,
+    FEWEST_FOR_DETAIL,
     HalfCapture,
     restore_detail,
     restore_octave,
 )
-from splinecli.estimate.refinement.detail import REACH as DETAIL_REACH
 from splinecli.estimate.refinement.features import (
-    Turn,
+    MapTurn,
     brightness,
     refine_features,
     turn_features,
@@ -48,7 +46,9 @@ from splinecli.estimate.refinement.tiles import (
     turned_part,
 )
 from splinecli.lights.lighting import LIT_AT_ONCE, LightingAt, PixelIndices, PixelLighting
+from splinecli.maths import Array, Bools, Float32Array
 from splinecli.maths.observation_map import map_scale
+from splinecli.maths.pixel_grid import slices
 from splinecli.system.machine import return_freed_memory, side_by_side
 from splinecli.system.progress import Progress, ignore
 
@@ -64,7 +64,6 @@ MOST_PIXELS = 150_000  # the most pixels of a capture that the net processes at 
 
 _DETAIL_MARGIN = -(-DETAIL_REACH // COARSEST) * COARSEST
 
-Floats = NDArray[np.float32]
 Maps = tuple[torch.Tensor, torch.Tensor]
 
 
@@ -72,11 +71,11 @@ Maps = tuple[torch.Tensor, torch.Tensor]
 class _Capture:
     """A capture to be refined, or a half of one."""
 
-    mask: NDArray[np.bool_]  # (H, W), with P true pixels
-    observations: Floats  # (P, F)
+    mask: Bools  # (H, W), with P true pixels
+    observations: Float32Array  # (P, F)
     lighting_at: LightingAt  # gives the light of some pixels
-    normals: Floats  # (P, 3), replaced, as are the errors (P, 2)
-    errors: Floats
+    normals: Float32Array  # (P, 3), replaced, as are the errors (P, 2)
+    errors: Float32Array
     reference: float  # reference, signs: of the whole capture; see refine_features
     signs: torch.Tensor
 
@@ -108,11 +107,11 @@ class NetworkRefiner:
     @torch.inference_mode()
     def refine(
         self,
-        mask: NDArray[np.bool_],
-        observations: Floats,
+        mask: Bools,
+        observations: Float32Array,
         lighting_at: LightingAt,
-        normals: Floats,
-        errors: Floats,
+        normals: Float32Array,
+        errors: Float32Array,
         *,
         progress: Progress = ignore,
     ) -> None:
@@ -125,39 +124,39 @@ class NetworkRefiner:
         each tile with the number of its pixels.
         """
         middle = lighting_at(np.array([len(normals) // 2])).directions  # the lights at one pixel
-        of_whole = (
+        capture = _Capture(
+            around_object(mask),
+            observations,
+            lighting_at,
+            normals,
+            errors,
             brightness(torch.from_numpy(observations)),
             alternating_signs(self._tensor(middle).view(-1, 3)),
         )
-        self._refine(
-            _Capture(around_object(mask), observations, lighting_at, normals, errors, *of_whole),
-            progress,
-        )
+        self._refine(capture, progress)
 
     def _refine(self, capture: _Capture, progress: Progress = ignore) -> None:
-        half, turns, margin, whole = (
-            None,
-            self.turns,
-            self.margin,
-            (capture.normals, capture.errors),
-        )
+        half, turns, margin = None, self.turns, self.margin
+        whole = capture.normals, capture.errors
         if len(capture.normals) > self.most_pixels:
             turns = 1
-            if len(capture.signs) >= FEWEST_LIGHTS:
+            if len(capture.signs) >= FEWEST_FOR_DETAIL:
                 half = HalfCapture.of(capture.mask, capture.lighting_at, *whole, capture.reference)
-                margin, of_half = (
-                    _DETAIL_MARGIN,
-                    (half.observations, half.lighting_at, half.normals, half.errors),
+                margin = _DETAIL_MARGIN
+                smaller = replace(
+                    capture,
+                    mask=around_object(half.mask),
+                    observations=half.observations,
+                    lighting_at=half.lighting_at,
+                    normals=half.normals,
+                    errors=half.errors,
                 )
-                self._refine(
-                    _Capture(around_object(half.mask), *of_half, capture.reference, capture.signs)
-                )
-        lit = (
-            torch.from_numpy(capture.observations).amax(dim=1) > 0
-        ).numpy()  # NumPy takes ten times as long
+                self._refine(smaller)
+        # NumPy takes ten times as long.
+        lit = (torch.from_numpy(capture.observations).amax(dim=1) > 0).numpy()
         above = Band(slice(0, 0), *whole)
 
-        def refine(tile: Tile) -> tuple[PixelIndices, Floats, Floats]:
+        def refine(tile: Tile) -> tuple[PixelIndices, Float32Array, Float32Array]:
             inside = tile.mask[tile.inner]
             own = tile.rows[tile.inner][inside]
             seen, inner = _with_neighbours(tile.inner, tile.mask.shape)
@@ -188,7 +187,7 @@ class NetworkRefiner:
             above = band
         above.write()
 
-    def _see(self, capture: _Capture, tile: Tile, seen: Part, turns: int) -> Maps:
+    def _see(self, capture: _Capture, tile: Tile, seen: Box, turns: int) -> Maps:
         """Return the net's normals (3, h, w) and errors (2, h, w) in a part of a tile, averaged
         over rotations.
         """
@@ -203,10 +202,10 @@ class NetworkRefiner:
                 capture.signs,
             )
 
-        features = self._maps(tile, CHANNELS, capture.lighting_at, features_of)
+        features = self._maps(tile, FEATURE_CHANNELS, capture.lighting_at, features_of)
         mask = self._tensor(tile.mask)[None]
         normals, errors = self._average_turns(features, mask, seen, turns)
-        if len(capture.signs) >= FEWEST_LIGHTS:
+        if len(capture.signs) >= FEWEST_FOR_DETAIL:
             features = features[:, *seen]
             estimated = features[channels("normal")]
             least_squares = estimated + features[channels("plain")]
@@ -215,7 +214,7 @@ class NetworkRefiner:
             )
         return normals, errors
 
-    def _enlarge(self, capture: _Capture, tile: Tile, seen: Part, half: HalfCapture) -> Maps:
+    def _enlarge(self, capture: _Capture, tile: Tile, seen: Box, half: HalfCapture) -> Maps:
         """Return normals (3, h, w) and errors (2, h, w) in a part of a tile: the half capture's,
         with detail.
         """
@@ -253,25 +252,22 @@ class NetworkRefiner:
         pixels.
         """
         maps = torch.zeros(*tile.mask.shape, columns, device=self._device)
-        rows, places = (
-            tile.rows[tile.mask],
-            torch.from_numpy(np.flatnonzero(tile.mask)).to(self._device),
-        )
-        for start in range(0, len(rows), LIT_AT_ONCE):
-            part = slice(start, start + LIT_AT_ONCE)
+        rows = tile.rows[tile.mask]
+        places = torch.from_numpy(np.flatnonzero(tile.mask)).to(self._device)
+        for part in slices(len(rows), LIT_AT_ONCE):
             maps.view(-1, columns)[places[part]] = values_of(
                 rows[part], lighting_at(rows[part]), part
             )
         return maps.permute(2, 0, 1)
 
     def _average_turns(
-        self, features: torch.Tensor, mask: torch.Tensor, wanted: Part, turns: int
+        self, features: torch.Tensor, mask: torch.Tensor, wanted: Box, turns: int
     ) -> Maps:
         """Return normals (3, h, w) and errors (2, h, w) of a part of the map, averaged over the
         turns of the map.
         """
         normals = errors = torch.zeros((), device=mask.device)
-        for turn in map(Turn, range(turns)):
+        for turn in map(MapTurn, range(turns)):
             turned, turned_mask = turn_features(features, turn), turn_maps(mask, turn)
             part = turned_part(wanted, mask.shape[-2:], turn.quarters)
             with torch.autocast(
@@ -286,23 +282,22 @@ class NetworkRefiner:
     def _device(self) -> torch.device:
         return self.network.enter.weight.device
 
-    def _tensor(self, values: NDArray[Any]) -> torch.Tensor:
+    def _tensor(self, values: Array) -> torch.Tensor:
         return torch.as_tensor(values, dtype=torch.float32, device=self._device)
 
 
-def _turn_back(normals: Floats, rows: PixelIndices, lighting_at: LightingAt) -> None:
+def _turn_back(normals: Float32Array, rows: PixelIndices, lighting_at: LightingAt) -> None:
     """Rotate normals (N, 3) of rows of a capture from the pixels' own frames into the capture's, in
     place.
     """
-    for start in range(0, len(rows), LIT_AT_ONCE):
-        part = slice(start, start + LIT_AT_ONCE)
+    for part in slices(len(rows), LIT_AT_ONCE):
         light = lighting_at(rows[part])
         if light.turns is None:
             break
         normals[part] = light.in_frame_of_capture(normals[part])
 
 
-def _with_neighbours(part: Part, shape: Sequence[int]) -> tuple[Part, Part]:
+def _with_neighbours(part: Box, shape: Sequence[int]) -> tuple[Box, Box]:
     """Return a part of a map of this shape with all pixels that its detail depends on, and where
     the part is in it.
     """

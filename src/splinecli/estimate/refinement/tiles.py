@@ -6,11 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.estimate.networks.refine_net import COARSEST, Part
-
-Floats = NDArray[np.float32]
-
-Box = tuple[slice, slice]  # rows and columns of a map, both with a start and a stop
+from splinecli.estimate.networks.refine_net import COARSEST, Box
+from splinecli.maths import Bools, Float32Array, Integers
+from splinecli.maths.pixel_grid import bounds
 
 
 @dataclass(frozen=True)
@@ -19,9 +17,9 @@ class Tile:
 
     box: Box  # where it is in the map, with the margin
     # (h, w), of the box; multiples of COARSEST, so that a rotated tile has the same cells
-    mask: NDArray[np.bool_]
-    rows: NDArray[np.integer]  # (h, w), the rows of its pixels in the capture
-    inner: Part  # the part of the box without the margin
+    mask: Bools
+    rows: Integers  # (h, w), the rows of its pixels in the capture
+    inner: Box  # the part of the box without the margin
 
 
 class Band:
@@ -31,11 +29,11 @@ class Band:
     The pixels follow one another in the capture, of which the normals (P, 3) and errors (P, 2) are.
     """
 
-    def __init__(self, pixels: slice, normals: Floats, errors: Floats) -> None:
+    def __init__(self, pixels: slice, normals: Float32Array, errors: Float32Array) -> None:
         self._pixels = pixels
         self._pairs = [(values, values[pixels].copy()) for values in (normals, errors)]
 
-    def put(self, rows: NDArray[np.integer], *refined: Floats) -> None:
+    def put(self, rows: Integers, *refined: Float32Array) -> None:
         """Keep refined normals and errors of some of the band's pixels."""
         for (_, kept), found in zip(self._pairs, refined, strict=True):
             kept[rows - self._pixels.start] = found
@@ -46,9 +44,7 @@ class Band:
             whole[self._pixels] = kept
 
 
-def rows_of_tiles(
-    mask: NDArray[np.bool_], tile: int, margin: int
-) -> Iterator[tuple[slice, Iterator[Tile]]]:
+def rows_of_tiles(mask: Bools, tile: int, margin: int) -> Iterator[tuple[slice, Iterator[Tile]]]:
     """Yield the pixels of each row of tiles, and its tiles that have pixels.
 
     The sides of the mask (H, W) and of a tile, and the context around it, are multiples of
@@ -70,8 +66,8 @@ def rows_of_tiles(
 
 
 def _tiles_of_band(
-    mask: NDArray[np.bool_],
-    rows: NDArray[np.integer],
+    mask: Bools,
+    rows: Integers,
     band: slice,
     inside: slice,
     tile: int,
@@ -84,32 +80,27 @@ def _tiles_of_band(
             yield Tile((band, outer), mask[:, outer], rows[:, outer], inner)
 
 
-def pixels_before(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+def pixels_before(mask: Bools) -> NDArray[np.int64]:
     """Return how many pixels of a mask (H, W) are above each of its rows, and in all of them (H +
     1,).
     """
     return np.concatenate(([0], np.count_nonzero(mask, axis=1).cumsum()))
 
 
-def around_object(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def around_object(mask: Bools) -> Bools:
     """Return the part of a mask that has pixels, between multiples of COARSEST. Behind the map it
     has a margin.
     """
-    bounds = []
-    for axis in (1, 0):
-        places = np.flatnonzero(mask.any(axis=axis))
-        bounds.append(
-            slice(places[0] // COARSEST * COARSEST, -(-(places[-1] + 1) // COARSEST) * COARSEST)
-        )
-    part = mask[tuple(bounds)]
-    missing = [
-        (0, side.stop - side.start - length)
-        for side, length in zip(bounds, part.shape, strict=True)
-    ]
-    return np.pad(part, missing)
+    (top, bottom), (left, right) = (
+        (first // COARSEST * COARSEST, -(-(last + 1) // COARSEST) * COARSEST)
+        for first, last in bounds(mask)
+    )
+    part = mask[top:bottom, left:right]
+    height, width = part.shape
+    return np.pad(part, ((0, bottom - top - height), (0, right - left - width)))
 
 
-def turned_part(part: Part, shape: tuple[int, ...], quarters: int) -> Part:
+def turned_part(part: Box, shape: tuple[int, ...], quarters: int) -> Box:
     """Return where a part of a map of this shape is after a counterclockwise rotation by `quarters`
     quarter turns.
     """

@@ -1,3 +1,1 @@
-"""Calibration of lights: directions from images of mirror balls, intensities from images of a gray
-target.
-"""
+"""Calibration of lights with mirror balls (directions) and gray targets (intensities)."""

@@ -1,5 +1,4 @@
-"""Light directions from folders of images of mirror balls: the camera, the highlights, and the
-balls together.
+"""Light directions from folders of images of mirror balls.
 
 The light direction follows from the highlight of a lamp in a mirror ball. The ball's normal n at
 the highlight halves the angle between the light direction l and the direction v to the camera, so l
@@ -27,12 +26,12 @@ from splinecli.capture.formats.images import (
     to_linear,
 )
 from splinecli.capture.near_lamps import read_camera_matrix
-from splinecli.capture.source import Progress
 from splinecli.errors import InputError
 from splinecli.lights.calibration.circle import Circle, circle_from_mask, find_circle
 from splinecli.maths import Array, Float32Array, Float64Array
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.pixel_grid import ray_basis
+from splinecli.system.progress import Progress, ignore
 
 # focal length, in pixels, from which a camera is treated as distant: all its rays are nearly
 # parallel
@@ -40,13 +39,7 @@ DISTANT = 1e6
 # of usual focal lengths, in longer sides of the image: 25 mm for 36 mm of film, as in telephones
 SHORTEST_LENS = 0.7
 # tags of EXIF
-_FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = (
-    0x920A,
-    0xA002,
-    0xA20E,
-    0xA210,
-    0xA405,
-)
+_FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = (0x920A, 0xA002, 0xA20E, 0xA210, 0xA405)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +74,7 @@ def unit_rays(points: Float64Array, matrix: Float64Array) -> Float64Array:
 
 
 def find_view(image: ImageHeader, matrix: Path | None) -> View:
-    """Return the camera that a file of its matrix, or an image's EXIF tags, describe; else a
-    distant one.
+    """Return the camera that a matrix file or an image's EXIF tags describe, else a distant one.
 
     Raises InputError if the file or the image cannot be read, or the file has no camera matrix.
     """
@@ -101,11 +93,8 @@ def _focal_length(tags: Mapping[int, Any], width: int, height: int) -> float | N
     millimetres = {2: 25.4, 3: 10.0}  # of an inch and of a centimetre, by EXIF's numbers of units
     try:
         if tags.get(_RESOLUTION) and tags.get(_FOCAL_LENGTH) and tags.get(_UNIT, 2) in millimetres:
-            pixels = (
-                float(tags[_FOCAL_LENGTH])
-                * float(tags[_RESOLUTION])
-                / millimetres[tags.get(_UNIT, 2)]
-            )
+            pixels = float(tags[_FOCAL_LENGTH]) * float(tags[_RESOLUTION])
+            pixels /= millimetres[tags.get(_UNIT, 2)]
             pixels *= width / float(tags.get(_WIDTH) or width)  # the picture may be scaled
         else:
             pixels = float(tags[_FILM]) / math.hypot(36, 24) * math.hypot(width, height)
@@ -141,9 +130,8 @@ def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = N
     # The blur removes bright single pixels, which are dust or noise.
     smooth = cv2.GaussianBlur(values, (0, 0), max(0.8, circle.radius / 200)) * inside
     brightest, median = float(smooth.max()), float(np.median(values[inside]))
-    if (
-        brightest <= 4.0 * median or brightest <= 0
-    ):  # smallest ratio of the highlight to the median of the ball
+    # smallest ratio of the highlight to the median of the ball
+    if brightest <= 4.0 * median or brightest <= 0:
         hint = (
             "Is this a folder of images of a mirror ball? If so, take the images with all other"
             " lights off: the lamp"
@@ -160,18 +148,17 @@ def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = N
     core = labels == light.argmax()
     y, x = np.nonzero(core)
     width = max(np.ptp(x), np.ptp(y))
-    if (
-        width > 0.3 * 2 * circle.radius
-    ):  # a wider patch is a window or an overexposed ball, not a lamp
-        problem = f"the brightest patch in the ball is {width} pixels wide, too wide for a lamp"
-        raise InputError(problem, hint="Shorten the exposure, or cover windows and bright walls")
+    if width > 0.3 * 2 * circle.radius:  # such as a window or an overexposed ball
+        raise InputError(
+            f"the brightest patch in the ball is {width} pixels wide, too wide for a lamp",
+            hint="Shorten the exposure, or cover windows and bright walls",
+        )
     # In a saturated highlight all weights are nearly equal, so the centroid is the middle of its
     # shape.
     weight = smooth[core].astype(np.float64) - 0.9 * _HIGHLIGHT_LEVEL * brightest
     saturated = float((values[core] >= full_scale).mean()) if full_scale is not None else 0.0
-    return Highlight(
-        float(np.average(x, weights=weight)), float(np.average(y, weights=weight)), saturated
-    )
+    x_centre, y_centre = (float(np.average(axis, weights=weight)) for axis in (x, y))
+    return Highlight(x_centre, y_centre, saturated)
 
 
 def ball_centre(outline: Float64Array, matrix: Float64Array) -> Float64Array:
@@ -196,8 +183,9 @@ def ball_centre(outline: Float64Array, matrix: Float64Array) -> Float64Array:
 def reflect(
     centre: Float64Array, highlights: Float64Array, matrix: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball; NaN outside
-    the ball.
+    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball.
+
+    They are NaN outside the ball.
     """
     rays = unit_rays(highlights, matrix)
     across = centre - (rays @ centre)[:, None] * rays
@@ -255,12 +243,11 @@ class CalibratedLights:
     disagreement_deg: Float64Array
 
 
-def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
-    """Return the files of the ball in a folder, with images in natural order or in the order of
-    filenames.txt.
+def find_ball_files(folder: Path, mask: Path | None = None) -> BallFiles:
+    """Return the files of the ball in a folder.
 
-    A mask that is given replaces the one in the folder. Raises InputError if the folder has no
-    images.
+    The images are in natural order or in the order of filenames.txt. A mask that is given replaces
+    the one in the folder. Raises InputError if the folder has no images.
     """
     not_lights, leave_out = (
         capture_files.NOT_PHOTOGRAPHS | set(REFERENCES),
@@ -269,27 +256,25 @@ def find_ball_files(folder: Path, *, mask: Path | None = None) -> BallFiles:
     images, listed = capture_files.find_images(
         folder, leave_out_stems=not_lights, leave_out=leave_out
     )
-    if not listed and 2 * sum(map(capture_files.is_mask_name, images)) < len(
-        images
-    ):  # such as chrome.mask.tga
-        images = tuple(image for image in images if not capture_files.is_mask_name(image))
+    photographs = tuple(path for path in images if not capture_files.is_mask_name(path))
+    if not listed and 2 * len(photographs) > len(images):  # others are such as chrome.mask.tga
+        images = photographs
     others = capture_files.list_images(folder, leave_out_stems=(), leave_out=images)
     reference = next((path for path in others if path.stem.lower() in REFERENCES), None)
     mask = mask or capture_files.find_named(folder, capture_files.MASK)
-    return BallFiles(
-        folder, images, reference, mask or capture_files.choose_mask(folder, images)[0]
-    )
+    mask = mask or capture_files.choose_mask(folder, images)[0]
+    return BallFiles(folder, images, reference, mask)
 
 
 def calibrate_ball(
     files: BallFiles,
-    *,
     circle: Circle | None = None,
     camera_matrix: Path | None = None,
-    progress: Progress = lambda: None,
+    progress: Progress = ignore,
 ) -> BallCalibration:
-    """Find the outline, the highlights and the light directions of one ball. Only one image is in
-    memory at a time.
+    """Find the outline, the highlights and the light directions of one ball.
+
+    Only one image is in memory at a time.
 
     Args:
         circle: the outline. None takes it from the mask, from the reference image, or from the mean
@@ -319,31 +304,32 @@ def calibrate_ball(
             point = np.array([(highlight.x, highlight.y)])
             normal, direction = reflect(centre, point, view.matrix)
             if not direction[0] @ unit_rays(point, view.matrix)[0] < 0:
-                problem = (
-                    "the highlight is near the rim of the ball: the lamp is level with the ball or"
-                    " behind it"
-                )
                 raise InputError(
-                    problem, hint="Place all lights on the camera's side of the object"
+                    "the highlight is near the rim of the ball: the lamp is level with the ball or"
+                    " behind it",
+                    hint="Place all lights on the camera's side of the object",
                 )
         except InputError as error:
             raise InputError(error.problem, path=path, hint=error.hint) from None
         highlights.append(highlight)
         normals.append(normal[0])
         directions.append(direction[0])
-        progress()
+        progress(1)
     found = (tuple(highlights), np.array(directions), np.array(normals))
     return BallCalibration(files, circle, circle_from, *found, view, shape)
 
 
 def combine_balls(balls: Sequence[BallCalibration]) -> CalibratedLights:
-    """Return the mean direction of each light over the balls. Raises InputError for unequal numbers
-    of images.
+    """Return the mean direction of each light over the balls.
+
+    Raises InputError for unequal numbers of images.
     """
     if len({len(ball.directions) for ball in balls}) > 1:
         counts = ", ".join(f"{len(ball.directions)} images ({ball.files.folder})" for ball in balls)
-        hint = "Every ball needs one image for each light, in the same order"
-        raise InputError(f"the balls have {counts}", hint=hint)
+        raise InputError(
+            f"the balls have {counts}",
+            hint="Every ball needs one image for each light, in the same order",
+        )
     stacked = np.stack([ball.directions for ball in balls])
     directions = unit(stacked.sum(axis=0))
     disagreement = np.stack([angle_between_deg(own, directions) for own in stacked]).max(axis=0)
@@ -371,9 +357,10 @@ def _find_outline(files: BallFiles) -> tuple[Circle, str]:
         ball = (
             f"the ball (centre {circle.x:.0f}, {circle.y:.0f}, radius {circle.radius:.0f} pixels)"
         )
-        hint = (
-            "Take images of the whole ball; if this is not the ball, give its circle with --circle"
-            " X,Y,R"
+        raise InputError(
+            f"{ball} is not entirely inside the image",
+            path=path,
+            hint="Take images of the whole ball; if this is not the ball, give its circle with"
+            " --circle X,Y,R",
         )
-        raise InputError(f"{ball} is not entirely inside the image", path=path, hint=hint)
     return circle, source

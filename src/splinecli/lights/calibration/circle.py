@@ -38,8 +38,9 @@ class Circle:
 
     @property
     def outline(self) -> Float64Array:
-        """The points (N, 2) of the outline near the circle. A near camera shows an ellipse instead
-        of a circle.
+        """The points (N, 2) of the outline near the circle.
+
+        A near camera shows an ellipse instead of a circle.
         """
         if self.points is not None:
             return self.points[
@@ -48,8 +49,9 @@ class Circle:
         return (self.x, self.y) + self.radius * _RAYS
 
     def normals(self, x: Float64Array, y: Float64Array) -> Float64Array:
-        """Return the unit normals (N, 3) of the ball at image points, orthographic; NaN outside the
-        circle.
+        """Return the unit normals (N, 3) of the ball at image points, NaN outside the circle.
+
+        The view is orthographic.
         """
         nx, ny = (x - self.x) / self.radius, (self.y - y) / self.radius
         with np.errstate(invalid="ignore"):
@@ -86,12 +88,10 @@ def circle_from_mask(mask: Bools) -> Circle:
     outline = outline + 0.5 * unit(outline - (circle.x, circle.y))
     circle = replace(circle, radius=circle.radius + 0.5, points=outline)
     if circle.visible < _MIN_VISIBLE:
-        problem = (
-            f"only {100 * circle.visible:.0f} % of the mask's outline is on a circle, expected a"
-            " ball"
-        )
         raise InputError(
-            problem, hint="Mark only the ball in the mask, or give its circle with --circle X,Y,R"
+            f"only {100 * circle.visible:.0f} % of the mask's outline is on a circle, expected a"
+            " ball",
+            hint="Mark only the ball in the mask, or give its circle with --circle X,Y,R",
         )
     return circle
 
@@ -144,8 +144,9 @@ def find_circle(image: Array) -> Circle:
 
 
 def _refine(values: Float32Array, guess: Circle) -> Circle | None:
-    """Return the circle through the strongest edges along rays from the guess's centre; None if too
-    few agree.
+    """Return the circle through the strongest edges along rays from the centre of a guess.
+
+    Return None if too few agree.
     """
     for band in (_SEARCH_BAND, _SEARCH_BAND / 2):
         half = max(band * guess.radius, 3.0)
@@ -174,10 +175,10 @@ def _refine(values: Float32Array, guess: Circle) -> Circle | None:
 
 
 def _fit(points: Float64Array, *, outline_points: int) -> Circle:
-    """Return the circle through most of the points (N, 2); a complete outline would have
-    `outline_points`.
+    """Return the circle through most of the points (N, 2).
 
-    RANSAC with samples of three points, then least squares over the points close to the circle.
+    A complete outline would have `outline_points`. RANSAC with samples of three points, then least
+    squares over the points close to the circle.
     """
     generator, size = np.random.default_rng(0), np.ptp(points, axis=0).max()
     best: tuple[float, float, float] | None = None

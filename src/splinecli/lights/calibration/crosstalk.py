@@ -1,27 +1,22 @@
-"""Crosstalk of three coloured lamps that light a matte gray ball at once: how much of each lamp a
-channel shows.
+"""Crosstalk of three coloured lamps that light a matte gray ball at once.
+
+It is the share of each lamp in each channel.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from splinecli.capture.channel_lights import CHANNELS, check_crosstalk
-from splinecli.capture.files import AMBIENT, CaptureFiles, find_named
-from splinecli.capture.formats.facts import check_exposures
-from splinecli.capture.formats.images import common_size
 from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
-from splinecli.capture.record import placeholders
-from splinecli.capture.source import CaptureSource
 from splinecli.errors import InputError
 from splinecli.lights.calibration.balls import BallFiles
-from splinecli.lights.calibration.lamps import target_normals
+from splinecli.lights.calibration.lamps import read_target
 from splinecli.maths import Bools, Float64Array, Floats
 
-_MOST_PIXELS, _MIN_PIXELS, _FITS = 1 << 16, 50, 10
+_MIN_PIXELS, _FITS = 50, 10
 
 
 def measure_crosstalk(
@@ -30,11 +25,10 @@ def measure_crosstalk(
     *,
     radiometry: RadiometricCalibration = AS_STORED,
 ) -> Float64Array:
-    """Return crosstalk matrices (N, 3, 3), with a mean diagonal of 1, from N colour images of a
-    matte gray ball.
+    """Return crosstalk matrices (N, 3, 3) from N colour images of a matte gray ball.
 
-    Least absolute deviations of I_c = sum over l of M[c, l] max(n . l_l, 0), over the pixels that
-    are not saturated.
+    Their mean diagonal is 1. Least absolute deviations of I_c = sum over l of M[c, l] max(n . l_l,
+    0), over the pixels that are not saturated.
 
     Args:
         files: colour images of the ball under all three lamps, and its mask.
@@ -50,27 +44,15 @@ def measure_crosstalk(
             f"found {count} colour images of the gray ball and {len(light_directions)} lights,"
             " expected three"
         )
-        hint = (
-            "For each colour image, photograph the mirror ball under each lamp alone, in the order"
-            " R, G, B"
+        raise InputError(
+            f"{problem} lights for each image",
+            path=files.folder,
+            hint="For each colour image, photograph the mirror ball under each lamp alone, in the"
+            " order R, G, B",
         )
-        raise InputError(f"{problem} lights for each image", path=files.folder, hint=hint)
-    mask, normals = target_normals(files, common_size(files.facts)[0][:2], "ball")
-    check_exposures(files.facts)
-    capture = CaptureSource(
-        files=CaptureFiles(
-            "gray ball", files.folder.name, files.folder, files.images, files.folder
-        ),
-        facts=files.facts,
-        light_directions=placeholders(count),
-        light_intensities=np.ones((count, 3)),
-        radiometry=replace(radiometry, ambient=find_named(files.folder, AMBIENT)),
-    )
-    rows = np.linspace(0, len(normals) - 1, min(len(normals), _MOST_PIXELS)).astype(np.intp)
+    normals, rows, images = read_target(files, "ball", radiometry)
     matrices = []
-    for number, image in enumerate(
-        capture.read_pixels(mask, range(count), lambda pixels: pixels, wanted=rows)
-    ):
+    for number, image in enumerate(images):
         saturated = np.zeros(len(normals), np.bool_)
         saturated[image.find_saturated(None).saturated] = True
         lights = light_directions[CHANNELS * number : CHANNELS * number + CHANNELS]

@@ -1,5 +1,4 @@
-"""Intensities of lamps from a gray target, positions of near ones from several balls, and the
-report of a calibration.
+"""Intensities of lamps, positions of near lamps, and the report of a calibration.
 
 Near lamps are located by triangulation from two or more mirror balls. Each ball gives a ray: from
 the highlight on its surface in the direction of the lamp. The balls' centres, which follow from the
@@ -8,7 +7,7 @@ plane.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -17,7 +16,8 @@ import numpy as np
 from splinecli.capture.files import AMBIENT, CaptureFiles, find_named
 from splinecli.capture.formats.facts import check_exposures
 from splinecli.capture.formats.images import ExpectedSize, common_size, read_mask
-from splinecli.capture.linearise import AS_STORED, RadiometricCalibration
+from splinecli.capture.linearise import AS_STORED, RadiometricCalibration, StoredPixels
+from splinecli.capture.record import placeholders
 from splinecli.capture.source import CaptureSource
 from splinecli.errors import InputError
 from splinecli.images.saturation import Saturation
@@ -30,7 +30,7 @@ from splinecli.lights.calibration.balls import (
     reflect,
 )
 from splinecli.lights.calibration.circle import Circle, circle_from_mask
-from splinecli.maths import Bools, Float64Array
+from splinecli.maths import Bools, Float64Array, Indices
 from splinecli.maths.normals import angle_between_deg
 from splinecli.maths.pixel_grid import focal_length, ray_basis
 
@@ -59,22 +59,13 @@ def measure_light_intensities(
     """
     n_lights = len(light_directions)
     if len(files.images) != n_lights:
-        problem = f"found {len(files.images)} images, expected {n_lights}, one for each light"
-        raise InputError(problem, path=files.folder)
-    mask, normals = target_normals(files, common_size(files.facts)[0][:2], target)
-    check_exposures(files.facts)
-    capture = CaptureSource(
-        files=CaptureFiles(
-            "gray target", files.folder.name, files.folder, files.images, files.folder
-        ),
-        facts=files.facts,
-        light_directions=light_directions,
-        light_intensities=np.ones((n_lights, 3)),
-        radiometry=replace(radiometry, ambient=find_named(files.folder, AMBIENT)),
-    )
-    rows = np.linspace(0, len(normals) - 1, min(len(normals), 1 << 16)).astype(np.int64)
+        raise InputError(
+            f"found {len(files.images)} images, expected {n_lights}, one for each light",
+            path=files.folder,
+        )
+    normals, rows, images = read_target(files, target, radiometry)
     values, found = [], []
-    for image in capture.read_pixels(mask, range(n_lights), lambda pixels: pixels, wanted=rows):
+    for image in images:
         found.append(image.find_saturated(None))
         values.append(image.linear.astype(np.float64))
     saturated = Saturation(len(normals), tuple(found), rows=rows, even=True).flags
@@ -92,17 +83,41 @@ def measure_light_intensities(
         ratios = ratios[(cosines[:, position] > smallest) & ~np.isnan(ratios).any(axis=1)]
         intensity = np.median(ratios, axis=0) if len(ratios) >= 50 else np.zeros(1)
         if not ((intensity > 0) & np.isfinite(intensity)).all():
-            problem = (
+            raise InputError(
                 "the target is dark or overexposed under this light, so the light's intensity is"
-                " unknown"
+                " unknown",
+                path=path,
+                hint="Every light needs an image of the target that is neither black nor saturated",
             )
-            hint = "Every light needs an image of the target that is neither black nor saturated"
-            raise InputError(problem, path=path, hint=hint)
         intensities[position] = intensity
     return np.asarray(intensities / intensities.mean())
 
 
-def target_normals(
+def read_target(
+    files: BallFiles, target: Target, radiometry: RadiometricCalibration
+) -> tuple[Float64Array, Indices, Iterator[StoredPixels]]:
+    """Return the normals (P, 3) of a target, and an iterator over its images.
+
+    Of each image, it yields the pixels whose numbers are returned, too.
+    """
+    mask, normals = _target_normals(files, common_size(files.facts)[0][:2], target)
+    check_exposures(files.facts)
+    count = len(files.images)
+    capture = CaptureSource(
+        files=CaptureFiles(
+            "gray target", files.folder.name, files.folder, files.images, files.folder
+        ),
+        facts=files.facts,
+        light_directions=placeholders(count),
+        light_intensities=np.ones((count, 3)),
+        radiometry=replace(radiometry, ambient=find_named(files.folder, AMBIENT)),
+    )
+    rows = np.linspace(0, len(normals) - 1, min(len(normals), 1 << 16)).astype(np.intp)
+    images = capture.read_pixels(mask, range(count), lambda pixels: pixels, wanted=rows)
+    return normals, rows, images
+
+
+def _target_normals(
     files: BallFiles, shape: tuple[int, ...], target: Target
 ) -> tuple[Bools, Float64Array]:
     """Return the mask (H, W) of the target and the normals (P, 3) of its pixels."""
@@ -128,8 +143,9 @@ _PIXEL_ERROR = 0.3
 
 @dataclass(frozen=True, eq=False)
 class LampPositions:
-    """The positions of F lamps; x right, y up, z to the camera, from the middle of the image on the
-    balls' plane.
+    """The positions of F lamps; x right, y up, z to the camera.
+
+    The origin is the middle of the image on the balls' plane.
     """
 
     positions: Float64Array  # (F, 3)
@@ -150,11 +166,11 @@ class LampPositions:
 def triangulate_lamps(
     balls: Sequence[BallCalibration], *, ball_diameter: float | None = None
 ) -> LampPositions | None:
-    """Return the positions of the lamps from balls photographed by one camera; None for balls at
-    one place.
+    """Return the positions of the lamps from balls photographed by one camera.
 
-    The uncertainty comes from repeating the computation with other pixels, heights of the balls and
-    cameras (View.draw). It is larger if the rays miss each other by more than this explains.
+    Return None for balls at one place. The uncertainty comes from repeating the computation with
+    other pixels, heights of the balls and cameras (View.draw). It is larger if the rays miss each
+    other by more than this explains.
 
     Args:
         balls: at least two balls, or one at two places.
@@ -184,10 +200,10 @@ def _positions(
     diameter: float | None,
     errors: np.random.Generator | None = None,
 ) -> tuple[Float64Array, float, float]:
-    """Return positions (F, 3), pixel size and the mean square angle by which the rays miss each
-    other.
+    """Return the positions (F, 3), the pixel size and the mean square angle between the rays.
 
-    `errors` draws errors of the pixels; None takes them as they are.
+    It is the angle by which the rays miss each other. `errors` draws errors of the pixels; None
+    takes them as they are.
     """
 
     def error(*shape: int) -> Float64Array:
@@ -225,8 +241,7 @@ def _positions(
 
 
 def intersect_rays(starts: Float64Array, directions: Float64Array) -> tuple[Float64Array, float]:
-    """Return the points (F, 3) nearest to B rays each, and the mean square angle by which the rays
-    miss them.
+    """Return the points (F, 3) nearest to B rays each, and the mean square angle of the misses.
 
     The rays are (B, F, 3), B at least 2, with unit directions that have equal random errors. A NaN
     gives NaN.
@@ -308,18 +323,18 @@ def calibration_report(
     }
 
 
-def summary_lines(report: dict[str, Any]) -> list[str]:
-    """Return the lines of a report for people: the outlines, and how well balls and compared lights
-    agree.
+def calibration_lines(report: dict[str, Any]) -> list[str]:
+    """Return the lines of a report for people.
+
+    They state the outlines, and how well the balls and the compared lights agree.
     """
     lines = []
     for ball in report["balls"]:
         circle = ball["circle"]
         lines.append(
             f"{ball['folder']}: circle {circle['x']:.1f}, {circle['y']:.1f}, radius"
-            f" {circle['radius']:.1f} pixels"
-            f" (from {circle['from']}, {100 * circle['seen']:.0f} % of the outline visible,"
-            f" spread {circle['spread']:.1f} pixels)"
+            f" {circle['radius']:.1f} pixels (from {circle['from']}, {100 * circle['seen']:.0f} %"
+            f" of the outline visible, spread {circle['spread']:.1f} pixels)"
         )
     if angles := report["disagreement_deg"]:
         lines.append(
@@ -348,10 +363,8 @@ def _warnings(
 ) -> list[str]:
     warnings = [
         f"{ball.files.folder}: the outline of the ball is uncertain"
-        f" ({100 * ball.circle.visible:.0f} % of it visible,"
-        f" spread {ball.circle.spread:.1f} pixels). Check {picture}; if the green"
-        " circle is wrong, give --mask or"
-        " --circle."
+        f" ({100 * ball.circle.visible:.0f} % of it visible, spread {ball.circle.spread:.1f}"
+        f" pixels). Check {picture}; if the green circle is wrong, give --mask or --circle."
         for ball in lights.balls
         # Less of the outline is visible, or it varies by more than 1 % of the radius.
         if ball.circle.visible < 0.6 or ball.circle.spread > 0.01 * ball.circle.radius
@@ -359,21 +372,18 @@ def _warnings(
     if lamps is not None and not lamps.known:
         warnings.append(
             "The rays from the balls are too parallel to measure the lamps' distances. If the"
-            " lamps are near, put the"
-            " balls farther apart."
+            " lamps are near, put the balls farther apart."
             if lamps.view.known
-            else "The lamps' distances are unknown, because the camera is: it is treated"
-            " as distant, which makes"
-            " the rays from the balls too parallel if it is near. If the lamps are near, add"
-            " --camera-matrix."
+            else "The lamps' distances are unknown, because the camera is: it is treated as"
+            " distant, which makes the rays from the balls too parallel if it is near. If the"
+            " lamps are near, add --camera-matrix."
         )
     worst = int(lights.disagreement_deg.argmax())
     largest = lights.disagreement_deg[worst]  # of exact balls it is below 5
     if largest > 5.0 and not (lamps is not None and lamps.known):
         warnings.append(
             f"The balls disagree by up to {largest:.1f} degrees, most under light {worst + 1}"
-            " (counted from 1)."
-            f" Check {picture}."
+            f" (counted from 1). Check {picture}."
         )
     if known is not None:
         difference = angle_between_deg(known, lights.directions).mean()
@@ -384,8 +394,8 @@ def _warnings(
         if difference > 3.0 and from_normals < difference / 3:
             warnings.append(
                 "The compared file contains the normals of the ball at the highlights instead of"
-                " the light directions:"
-                " each is half-way between the view and the light. Use the file written here."
+                " the light directions: each is half-way between the view and the light. Use the"
+                " file written here."
             )
     return warnings
 

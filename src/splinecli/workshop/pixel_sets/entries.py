@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from splinecli.capture import capture_name, open_capture
+from splinecli.capture import CaptureOptions, capture_name, open_capture
 from splinecli.capture.files import digest
 from splinecli.capture.record import name_reading
 from splinecli.errors import InputError, OutputError
@@ -65,7 +65,7 @@ def add_capture(
     it changed since its entry was created, and `update` is not set; OutputError if the entry cannot
     be written.
     """
-    source = open_capture(folder, white_level=white_level)
+    source = open_capture(folder, CaptureOptions(white_level=white_level))
     recipe: dict[str, Any] = {
         "source": str(folder.resolve()),
         "reading": name_reading(as_stored=as_stored),

@@ -7,8 +7,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from splinecli.materials.principled import PrincipledMaterial
 from splinecli.workshop.synthesis import draw_uniform
+from splinecli.workshop.synthesis.principled import PrincipledMaterial
 
 # Thresholds on the uniform number that selects the kind of material: matte below the first, then as
 # named; and the material classes of the rendered scenes as ranges of that number.

@@ -16,13 +16,13 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from splinecli.materials.principled import PrincipledMaterial
 from splinecli.maths.observation_map import MAP_SIZE, cell_directions, dot, rotate_about_view_axis
 from splinecli.records.base import Share
 from splinecli.workshop.synthesis import draw_uniform
 from splinecli.workshop.synthesis.batches import CaptureConfig, DenseMap, PixelBatch
 from splinecli.workshop.synthesis.draw_materials import choose, draw_material
 from splinecli.workshop.synthesis.lights import draw_light_counts, draw_light_directions
+from splinecli.workshop.synthesis.principled import PrincipledMaterial
 from splinecli.workshop.synthesis.whole_capture import photograph_captures
 
 

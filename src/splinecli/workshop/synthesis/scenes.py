@@ -28,10 +28,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splinecli.materials.principled import PrincipledMaterial
 from splinecli.maths.normals import unit
 from splinecli.workshop.synthesis.draw_materials import CLASSES, draw_material, with_one_gloss
 from splinecli.workshop.synthesis.meshes import Floats, Mesh
+from splinecli.workshop.synthesis.principled import PrincipledMaterial
 from splinecli.workshop.synthesis.ray_tracing import (
     TRACED_ROWS,
     Hits,

@@ -25,11 +25,12 @@ from torch.distributed.rendezvous import rendezvous
 
 from splinecli.errors import ModelError, OutputError, UsageError
 from splinecli.estimate.networks.spline_net import SplineNet
-from splinecli.estimate.networks.weights import resolve_weights, save_weights
+from splinecli.estimate.networks.weights import resolve_weights
 from splinecli.system.files import check_writable, write_text
 from splinecli.system.machine import choose_device, choose_precision, use_available_cores
 from splinecli.system.progress import SILENT, Observer
 from splinecli.system.publishing import held_folder
+from splinecli.workshop.save_weights import save_weights
 from splinecli.workshop.synthesis import stream_seed
 from splinecli.workshop.training import (
     CHECKPOINT,

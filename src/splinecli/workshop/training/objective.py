@@ -13,11 +13,11 @@ from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample
+from torch.nn.functional import avg_pool2d, grid_sample, softplus
 
-from splinecli.estimate.networks.li_ne_net import error_negative_log_likelihood
-from splinecli.estimate.networks.spline_net import PixelMaps, Rotation, SplineNet, to_pixel_frame
-from splinecli.maths.observation_map import cell_directions
+from splinecli.estimate.networks.li_ne_net import MORE_DEG
+from splinecli.estimate.networks.spline_net import PixelMaps, Rotation, SplineNet
+from splinecli.maths.observation_map import cell_directions, rotate_about_view_axis
 from splinecli.workshop.synthesis.batches import DenseMap, PixelBatch
 from splinecli.workshop.training.config import Norm, TrainingConfig
 
@@ -261,3 +261,18 @@ def asymmetric_loss(fine: Tensor, coarse: Tensor, *, eta: float, lambda_c: float
     expected asymmetry, summed over cells. `fine` and `coarse` are the results of `asymmetries`.
     """
     return ((fine - eta).abs() + lambda_c * (coarse - eta).abs()).mean()
+
+
+def error_negative_log_likelihood(error: Tensor, angle: Tensor) -> Tensor:
+    """Return the negative log-likelihood (P,) of the logs of errors (P,), in radians, under
+    distributions (P, 2).
+    """
+    median, shape = error.unbind(-1)
+    z = shape.exp() * ((angle + math.radians(MORE_DEG)).log() - median)
+    return z + 2 * softplus(-z) - shape
+
+
+def to_pixel_frame(vectors: Tensor, maps: PixelMaps) -> Tensor:
+    """Rotate vectors (P, 3) from the capture's frame into the pixels' frames."""
+    turned = rotate_about_view_axis(vectors, maps.cosine, maps.sine)
+    return turned * turned.new_tensor((1.0, -1.0, 1.0)) if maps.mirrored else turned

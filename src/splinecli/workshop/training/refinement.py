@@ -16,12 +16,11 @@ from torch.nn.functional import pad
 from splinecli.estimate.fits.least_squares import alternating_signs
 from splinecli.estimate.inference import estimate_pixels
 from splinecli.estimate.methods.batched import NetworkEstimator
-from splinecli.estimate.networks.li_ne_net import error_negative_log_likelihood
 from splinecli.estimate.networks.refine_net import channels, split_features
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import LoadedNetwork
 from splinecli.estimate.refinement.features import (
-    Turn,
+    MapTurn,
     brightness,
     refine_features,
     turn_features,
@@ -43,7 +42,7 @@ from splinecli.workshop.synthesis.whole_capture import (
     photograph_scene,
     scatter,
 )
-from splinecli.workshop.training.objective import angles, balanced
+from splinecli.workshop.training.objective import angles, balanced, error_negative_log_likelihood
 
 # Captures simulated before the first step. With 64, the net memorised them and was worse on others
 # for half an hour.
@@ -177,7 +176,7 @@ class ScenePool:
         ):
             example = self.examples[int(index)]
             draw = torch.rand(3, generator=generator, device=generator.device).tolist()
-            turn = Turn(int(4 * draw[0]), draw[1] < 0.5)
+            turn = MapTurn(int(4 * draw[0]), draw[1] < 0.5)
             features = turn_features(example.features, turn).clone()
             if draw[2] < 0.5:
                 features[channels("halves")].neg_()

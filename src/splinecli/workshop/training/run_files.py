@@ -29,9 +29,9 @@ from splinecli.system.weight_files import (
     load_strictly,
     read_json_entry,
     read_tensors,
-    serialise,
     tensors_sha256,
 )
+from splinecli.workshop.save_weights import serialise
 from splinecli.workshop.training import EVENTS, METRICS
 from splinecli.workshop.training.config import TrainingConfig
 from splinecli.workshop.training.tasks import SampleMaps
@@ -113,11 +113,7 @@ class RunLog:
         if maps is None:
             return
         figure = observation_map_figure(
-            maps.sparse,
-            maps.dense,
-            maps.truth,
-            error_deg=maps.error_deg,
-            truth_label="true map, gaps filled",
+            maps.sparse, maps.dense, {"true map, gaps filled": maps.truth}, error_deg=maps.error_deg
         )
         write_bytes(self.folder / TRAINING_MAPS, figure)
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splinecli.errors import InputError, UsageError
-from splinecli.estimate.networks.spline_net import PixelMaps, SplineNet, to_pixel_frame
+from splinecli.estimate.networks.spline_net import PixelMaps, SplineNet
 from splinecli.maths.normals import angle_between_deg
 from splinecli.workshop.pixel_sets.source import PixelSetSource
 from splinecli.workshop.pixel_sets.store import Entry, PixelSet, open_pixel_set
@@ -32,6 +32,7 @@ from splinecli.workshop.training.objective import (
     dense_truth_in_frame,
     fixed,
     part_of_step,
+    to_pixel_frame,
 )
 from splinecli.workshop.training.refinement import (
     FIRST_EXAMPLES,

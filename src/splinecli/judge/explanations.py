@@ -12,7 +12,7 @@ weight of the residuals, since no real material is matte. Both were fitted to ca
 classes of materials with and without these faults (benchmarks/capture_faults.py --fit).
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, NamedTuple, get_args
@@ -23,7 +23,12 @@ from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.sample import Sample
 from splinecli.maths import Float64Array
 from splinecli.maths.normals import angle_between_deg, spread_of, unit
-from splinecli.maths.robust import absolute_weights, fit_scaled_normals, lit_values, shade
+from splinecli.maths.robust import (
+    absolute_weights,
+    inverse_3x3,
+    lit_values,
+    multiply_symmetric,
+)
 
 Kind = Literal["curve", "near", "offset", "intensities"]
 ALL_KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -34,11 +39,12 @@ COSTS: dict[Kind, float] = {"curve": 2.35, "near": 2.6, "offset": 3.35, "intensi
 POWERS: dict[Kind, float] = {"curve": 6.2, "near": 8.1, "offset": 5.7, "intensities": 2.8}
 LIKELY = 0.5  # probability from which a reading is named
 _LEAST_LIGHTS: dict[Kind, int] = {"curve": 6, "near": 6, "offset": 4, "intensities": 6}
+_ROWS, _COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]  # xx, yy, zz, xy, xz, yz of a product
 _SHADOW = 0.1  # of a pixel's largest value; smaller values are shadow
 
 
 @dataclass(frozen=True, eq=False)
-class Reading:
+class Explanation:
     """A reading of the images, and how well it fits."""
 
     kind: Kind
@@ -53,7 +59,7 @@ class Reading:
 class Doubt(NamedTuple):
     """How likely the given reading is wrong, and the reading that is right then."""
 
-    reading: Reading
+    reading: Explanation
     probability: float  # that any other reading is right
     others: tuple[Kind, ...]  # kinds of readings that the images hardly distinguish from it
 
@@ -65,7 +71,7 @@ class _Fit:
     intensities: Float64Array
 
 
-class Readings:
+class Explanations:
     """The pixels of a sample, whose observations are as stored, and the readings that were fitted
     to them.
 
@@ -98,7 +104,7 @@ class Readings:
         self.shape, self.eight_bit = sample.mask.shape, eight_bit
         self.are_enough = n_lights >= 4 and len(self.values) >= 60
 
-    def fit(self, kinds: Collection[Kind]) -> list[Reading]:
+    def fit(self, kinds: Collection[Kind]) -> list[Explanation]:
         """Return the best reading of each of these kinds; none of too few lit pixels or lights."""
         if not self.are_enough:
             return []
@@ -106,13 +112,13 @@ class Readings:
             kind for kind in ALL_KINDS if kind in kinds and len(self.lights) >= _LEAST_LIGHTS[kind]
         ]
         vectors = self._with(self.lights)
-        given, found = _fit(self.values, vectors), list[Reading]()
+        (given,), found = _fit(self.values, vectors), list[Explanation]()
         if "offset" in kinds:
             found.append(_best("offset", self._offset_fits(vectors), given))
         if "curve" in kinds:
             found.append(self._best_curve())
         if not {"near", "intensities"}.isdisjoint(kinds):
-            free = _fit(self.values, vectors, free=True)
+            (free,) = _fit(self.values, vectors, free=True)
         if "near" in kinds:
             found.append(self._best_near(free))
         if "intensities" in kinds:
@@ -157,36 +163,36 @@ class Readings:
             (reading for reading in found if reading.kind == ranked[0]),
             key=lambda reading: reading.evidence,
         )
-        # Readings that are this likely, compared with the likeliest one, are named beside it.
+        # Explanations that are this likely, compared with the likeliest one, are named beside it.
         others = [kind for kind in ranked[1:] if shares[kind] > 0.3 * shares[ranked[0]]]
         return Doubt(best, sum(shares.values()), tuple(others))
 
-    def error_deg(self, reading: Reading, used: Float64Array | None = None) -> float:
+    def error_deg(self, reading: Explanation, used: Float64Array | None = None) -> float:
         """Return the median angle in degrees between a reading's normals and the given reading's.
 
         `used` are the intensities (F,) that were estimated and are divided out; None for none.
         """
         lights = self.lights if used is None else self.lights * used[:, None]
-        given = _fit(self.values, self._with(lights))
+        (given,) = _fit(self.values, self._with(lights))
         return float(np.median(angle_between_deg(unit(given.normals), unit(reading.normals))))
 
-    def _best_curve(self, *, free: bool = False) -> Reading:
-        vectors, shadow = self._with(self.lights), 0.35  # encoded shadows are brighter
-        given = _fit(self.values, vectors, free=free, shadow=shadow)
-        fits = {
-            gamma: _fit(self.values, vectors, gamma, free=free, shadow=shadow)
-            for gamma in _EXPONENTS
-        }
-        return _best("curve", fits, given, -0.8 if self.eight_bit else 0.0)
+    def _best_curve(self, *, free: bool = False) -> Explanation:
+        # encoded shadows are brighter
+        vectors, gammas = self._with(self.lights), (1.0, *_EXPONENTS)
+        given, *fits = _fit(self.values, vectors, gammas, free=free, shadow=0.35)
+        return _best(
+            "curve",
+            dict(zip(_EXPONENTS, fits, strict=True)),
+            given,
+            -0.8 if self.eight_bit else 0.0,
+        )
 
-    def _best_near(self, given: _Fit) -> Reading:
+    def _best_near(self, given: _Fit) -> Explanation:
         """Return the best distance. Intensities are free: near lamps look unequal, and unequal
         lamps may be near.
         """
-        fits = {
-            widths: _fit(self.values, self._with(self._near(widths)), free=True)
-            for widths in _WIDTHS
-        }
+        lights = np.stack([self._with(self._near(widths)) for widths in _WIDTHS])
+        fits = dict(zip(_WIDTHS, _fit(self.values, lights, free=True), strict=True))
         best = _best("near", fits, given)
         places = np.stack((self.columns, -self.rows), axis=1)
         # On a ball, gloss varies with the position, like the light of near lamps. It is round if a
@@ -206,14 +212,13 @@ class Readings:
         """Return fits with constant light, over the value of a pixel that faces the light, and
         around the best one.
         """
-        offsets = (0.02 * 1.5**k for k in range(16))
-        fits = {offset: _fit(self.values, vectors, offset=offset) for offset in offsets}
+        fits = _fit_with_offsets(self.values, vectors, [0.02 * 1.5**k for k in range(16)])
         for _ in range(3):  # halve the interval around the best constant light
             tried = sorted(fits)
             best = tried.index(min(tried, key=lambda offset: fits[offset].residual))
-            for one, other in pairwise(tried[max(best - 1, 0) : best + 2]):
-                between = float(np.sqrt(one * other))
-                fits[between] = _fit(self.values, vectors, offset=between)
+            around = pairwise(tried[max(best - 1, 0) : best + 2])
+            between = [float(np.sqrt(one * other)) for one, other in around]
+            fits |= _fit_with_offsets(self.values, vectors, between)
         return fits
 
     def _near(self, widths: float) -> Float64Array:
@@ -225,7 +230,7 @@ class Readings:
         return lights if self.intensities is None else lights * self.intensities[:, None]
 
 
-def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0) -> Reading:
+def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0) -> Explanation:
     """Return the best of some fits by their amounts, with this cost added to the cost of its kind.
 
     The pixels of a flat object repeat each other, so that a reading may fit them by chance.
@@ -244,7 +249,7 @@ def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0
         # full weight, and the share of the weight for a plate.
         power *= float(np.clip(spread / 0.3, 0.45, 1))
     evidence = -COSTS[kind] - cost - power * np.log(ratio)
-    return Reading(kind, amount, ratio, float(evidence), found.normals, found.intensities)
+    return Explanation(kind, amount, ratio, float(evidence), found.normals, found.intensities)
 
 
 def _cost_of_equal(intensities: Float64Array) -> float:
@@ -256,60 +261,132 @@ def _cost_of_equal(intensities: Float64Array) -> float:
 def _fit(
     values: Float64Array,
     lights: Float64Array,
-    gamma: float = 1.0,
+    gammas: Sequence[float] = (1.0,),
     *,
-    offset: float = 0.0,
     free: bool = False,
     shadow: float = _SHADOW,
-) -> _Fit:
-    """Fit values^gamma = e (max(l . b, 0) + offset |b|) by least absolute deviations of the values.
+) -> list[_Fit]:
+    """Fit values^gamma = e max(l . b, 0) by least absolute deviations of the values, side by side
+    for each gamma and each set of lights.
 
-    Values (p, F) are scaled to 1; lights are (F, 3) or (p, F, 3), of any length. Intensities e are
-    1 or free.
+    Values (p, F) are scaled to 1; lights are (F, 3) or (H, p, F, 3), of any length. Intensities e
+    are 1 or free.
     """
-    lit = (values > shadow).astype(np.float64)
-    observed = values**gamma
+    stored, vectors = values.T, _by_axis(lights)
+    gamma = np.array(gammas)[:, None, None]
+    lit = stored > shadow
     # The slope of the linear value over the stored one, so that all readings have the same errors.
-    weights = start = lit / (gamma * np.maximum(values, shadow) ** (gamma - 1))
-    intensities = np.ones(values.shape[1])
-    if offset:
-        # 0.8 is the usual cosine between a normal and the light under which its pixel is brightest.
-        above = np.maximum(observed - offset / (offset + 0.8), 0)
-        normals = fit_scaled_normals(above, start, lights)
-    for _ in range(14 if offset else 30 if free else 8):
-        if offset:
-            facing = (shade(normals, lights) > 0)[..., None]
-            # Newton's step on |b|, halved: with much constant light, whole steps miss.
-            next_normals = fit_scaled_normals(
-                observed, weights, facing * lights + offset * unit(normals)[:, None]
-            )
-            normals = (normals + next_normals) / 2
-            predicted = np.maximum(shade(normals, lights), 0) + offset * np.linalg.norm(
-                normals, axis=1, keepdims=True
-            )
-        else:
-            normals = fit_scaled_normals(observed, weights, lights * intensities[:, None])
-            predicted = shade(normals, lights) * intensities
-        weights = start * absolute_weights(observed - predicted)
+    start = lit / (gamma * np.maximum(stored, shadow) ** (gamma - 1))
+    observed, weights, products = stored**gamma, start, _products(vectors)
+    count = max(len(gammas), len(vectors))
+    intensities = np.ones((count, len(stored)))
+    for _ in range(30 if free else 8):
+        e = intensities[..., None]
+        scaled = weights * e
+        normals = _solve(products, vectors, scaled * e, scaled * observed)
+        equal = _shade(normals, vectors)
+        weights = start * absolute_weights(observed - equal * e)
         if free:
-            intensities = _intensities(observed, predicted / intensities, weights, intensities)
-    residuals = np.abs(values - np.maximum(predicted, 0) ** (1 / gamma))[lit > 0]
+            intensities = _intensities(observed, equal, weights, intensities)
+    left = np.abs(stored - np.maximum(equal * e, 0) ** (1 / gamma))[:, lit]
+    return _described(left, normals, intensities)
+
+
+def _fit_with_offsets(
+    values: Float64Array, lights: Float64Array, offsets: Sequence[float]
+) -> dict[float, _Fit]:
+    """Fit values = max(l . b, 0) + offset |b|, as in _fit, for lights (F, 3) and each offset."""
+    stored, vectors = values.T, _by_axis(lights)
+    products, offset = _products(vectors), np.array(offsets)[:, None, None]
+    lit = stored > _SHADOW
+    start = lit.astype(np.float64)
+    # 0.8 is the usual cosine between a normal and the light under which its pixel is brightest.
+    above = np.maximum(stored - offset / (offset + 0.8), 0)
+    weights = np.broadcast_to(start, above.shape)
+    normals = _solve(products, vectors, weights, weights * above)
+    for _ in range(14):
+        # Newton's step on |b|, halved: with much constant light, whole steps miss. Its vectors are
+        # those of lights that the pixel faces, plus the offset along its normal.
+        facing = weights * (_shade(normals, vectors) > 0)
+        along = offset * np.moveaxis(unit(np.moveaxis(normals, 1, -1)), -1, 1)
+        light = _sum_over_lights(vectors, facing)
+        sums = _sum_over_lights(products, facing)
+        sums += along[:, _ROWS] * light[:, _COLUMNS] + along[:, _COLUMNS] * light[:, _ROWS]
+        sums += along[:, _ROWS] * along[:, _COLUMNS] * weights.sum(axis=1, keepdims=True)
+        right_side = _sum_over_lights(vectors, facing * stored)
+        right_side += along * (weights * stored).sum(axis=1, keepdims=True)
+        normals = (normals + _solution(sums, right_side)) / 2
+        predicted = np.maximum(_shade(normals, vectors), 0)
+        predicted += offset * np.linalg.norm(normals, axis=1, keepdims=True)
+        weights = start * absolute_weights(stored - predicted)
+    left = np.abs(stored - np.maximum(predicted, 0))[:, lit]
+    found = _described(left, normals, np.ones((len(offsets), len(stored))))
+    return dict(zip(offsets, found, strict=True))
+
+
+def _described(
+    residuals: Float64Array, normals: Float64Array, intensities: Float64Array
+) -> list[_Fit]:
+    """Return fits from their residuals (H, n), normals (H, 3, p) and intensities (H, F)."""
+    mean = residuals.mean(axis=1)
     # The fits to few lights pass through most values. The median would be zero.
-    typical = np.median(residuals) if values.shape[1] >= 8 else residuals.mean()
-    return _Fit(float(np.sqrt(residuals.mean() * typical)), np.asarray(normals), intensities)
+    typical = np.median(residuals, axis=1) if intensities.shape[1] >= 8 else mean
+    sizes = np.sqrt(mean * typical).tolist()
+    return [_Fit(*each) for each in zip(sizes, normals.swapaxes(1, 2), intensities, strict=True)]
+
+
+def _by_axis(lights: Float64Array) -> Float64Array:
+    """Return lights (F, 3) or (H, p, F, 3) as (1, 3, F, 1) or (H, 3, F, p)."""
+    if lights.ndim == 2:
+        return lights.T[None, :, :, None]
+    return np.ascontiguousarray(np.moveaxis(lights, (1, 2, 3), (3, 2, 1)))
+
+
+def _products(vectors: Float64Array) -> Float64Array:
+    """Return the products (H, 6, F, p) of the components of vectors (H, 3, F, p)."""
+    return vectors[:, _ROWS] * vectors[:, _COLUMNS]
+
+
+def _solve(
+    products: Float64Array, vectors: Float64Array, weights: Float64Array, weighted: Float64Array
+) -> Float64Array:
+    """Return scaled normals (H, 3, p) for weights (H, F, p) and weighted values; see
+    fit_scaled_normals.
+    """
+    return _solution(_sum_over_lights(products, weights), _sum_over_lights(vectors, weighted))
+
+
+def _solution(sums: Float64Array, right_side: Float64Array) -> Float64Array:
+    sums[:, :3] += 1e-6
+    covariance = inverse_3x3(tuple(sums.swapaxes(0, 1)), 1e-6)
+    return np.stack(multiply_symmetric(covariance, tuple(right_side.swapaxes(0, 1))), axis=1)
+
+
+def _sum_over_lights(terms: Float64Array, values: Float64Array) -> Float64Array:
+    """Return the sums (H, K, p) of terms (H, K, F, p) times values (H, F, p)."""
+    if terms.shape[3] == 1:
+        return np.asarray(terms[..., 0] @ values)
+    return np.asarray(np.einsum("hkfp,hfp->hkp", terms, values))
+
+
+def _shade(normals: Float64Array, vectors: Float64Array) -> Float64Array:
+    """Return the shading (H, F, p) of scaled normals (H, 3, p) under lights (H, 3, F, p)."""
+    if vectors.shape[3] == 1:
+        return np.asarray(vectors[..., 0].swapaxes(1, 2) @ normals)
+    return np.asarray(np.einsum("hkfp,hkp->hfp", vectors, normals))
 
 
 def _intensities(
     observed: Float64Array, equal: Float64Array, weights: Float64Array, before: Float64Array
 ) -> Float64Array:
-    """Return the next intensities (F,) from the values (p, F) predicted for lights of intensity
-    1.
+    """Return the next intensities (H, F) from the values (H, F, p) predicted for lights of
+    intensity 1.
     """
-    weights = weights * (equal > 0.2 * equal.max(axis=1, keepdims=True))  # the rest may be shadow
-    power = (weights * equal**2).sum(axis=0)
-    found = np.where(
-        power > 0, (weights * equal * observed).sum(axis=0) / np.maximum(power, 1e-12), before
-    )
-    found = np.clip(found / found.mean(), 0.05, 20)
+    # the rest may be shadow
+    weighted = weights * (equal > 0.2 * equal.max(axis=1, keepdims=True)) * equal
+    power = (weighted * equal).sum(axis=2)
+    found = (weighted * observed).sum(axis=2) / np.maximum(power, 1e-12)
+    found = np.where(power > 0, found, before)
+    found = np.clip(found / found.mean(axis=1, keepdims=True), 0.05, 20)
     intensities = before * (found / before) ** 1.5  # larger changes save a third of the fits
-    return np.asarray(intensities / intensities.mean())
+    return np.asarray(intensities / intensities.mean(axis=1, keepdims=True))

@@ -5,8 +5,7 @@ The BRDF is isotropic and gray. A pixel's observation is the mean of its colour 
 model is nearly linear in the base colour, so one channel is enough. Every parameter is a tensor (P,
 1).
 
-As in Disney's own later code, Smith's shadowing uses the roughness directly, without the remapping
-of 2012. The lobe is never narrower than at roughness 0.1, which float32 still resolves.
+materials/lobes.py has the lobes that are also fitted to photographs.
 """
 
 from __future__ import annotations
@@ -16,6 +15,14 @@ from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
+
+from splinecli.materials.lobes import (
+    facets,
+    half_vector_cosines,
+    power,
+    schlick_weight,
+    smith_ggx,
+)
 
 
 @dataclass(frozen=True)
@@ -61,10 +68,7 @@ class PrincipledMaterial:
         positive. l_dot_v is (D) or (P, D).
         """
         lit = n_dot_l.clamp(min=0)
-        # Light from behind the surface has no half vector, and rounding would give NaN.
-        l_dot_h = ((1 + l_dot_v) / 2).clamp(min=1e-6).sqrt()
-        n_dot_h = ((n_dot_l + n_dot_v) / (2 * l_dot_h)).clamp(0, 1)
-        n_dot_h_squared = n_dot_h * n_dot_h
+        l_dot_h, n_dot_h_squared = half_vector_cosines(n_dot_l, n_dot_v, l_dot_v)
         fresnel = schlick_weight(l_dot_h)
 
         grazing_90 = torch.where(
@@ -76,7 +80,7 @@ class PrincipledMaterial:
             1 + grazing_90 * schlick_weight(n_dot_v)
         )
         if bool((self.minnaert != 1).any()):
-            diffuse = diffuse * _power((lit * n_dot_v).clamp(min=1e-4), self.minnaert - 1)
+            diffuse = diffuse * power((lit * n_dot_v).clamp(min=1e-4), self.minnaert - 1)
         if bool((self.retro > 0).any()):
             # The retro-reflective lobe is ((1 + l.v) / 2)^20, half as high where light and view are
             # 21 degrees apart.
@@ -84,10 +88,10 @@ class PrincipledMaterial:
         diffuse = (1 - self.metallic) * (self.base * diffuse + math.pi * self.sheen * fresnel)
 
         f0 = (0.08 * self.specular * (1 - self.metallic) + self.base * self.metallic).clamp(max=1)
-        specular = _facets(n_dot_h_squared, lit, n_dot_v, self.roughness, self.tail_exponent)
+        specular = facets(n_dot_h_squared, lit, n_dot_v, self.roughness, self.tail_exponent)
         if bool((self.second_share > 0).any()):
             ggx = torch.full_like(self.tail_exponent, 2.0)
-            second = _facets(n_dot_h_squared, lit, n_dot_v, self.second_roughness, ggx)
+            second = facets(n_dot_h_squared, lit, n_dot_v, self.second_roughness, ggx)
             specular = torch.lerp(specular, second, self.second_share)
         radiance = diffuse + specular * (f0 + (1 - f0) * fresnel)
 
@@ -109,43 +113,3 @@ class PrincipledMaterial:
     def albedo(self) -> Tensor:
         """Return the diffuse albedo plus the mean specular reflectance (P, 1)."""
         return self.base + 0.08 * self.specular * (1 - self.metallic)
-
-
-def _facets(
-    n_dot_h_squared: Tensor, lit: Tensor, n_dot_v: Tensor, roughness: Tensor, tail_exponent: Tensor
-) -> Tensor:
-    """Return the microfacet distribution times its shadowing; this is GGX if the tail exponent is
-    2.
-    """
-    alpha_squared = (roughness**4).clamp(min=1e-4)
-    spread = n_dot_h_squared * (alpha_squared - 1) + 1
-    if bool((tail_exponent < 2).any()):
-        # pi times the factor that normalises the facets 1 / (1 + (a^2 - 1) (n.h)^2)^gamma; a^2 at
-        # gamma = 2
-        narrow = alpha_squared.clamp(max=0.999)
-        norm = (tail_exponent - 1) * (1 - narrow) / (narrow ** (1 - tail_exponent) - 1)
-        lobe = norm * _power(spread, -tail_exponent)
-    else:
-        lobe = alpha_squared / (spread * spread)
-    return lobe * smith_ggx(n_dot_v, alpha_squared) * smith_ggx(lit, alpha_squared)
-
-
-def schlick_weight(cosine: Tensor) -> Tensor:
-    """Return (1 - cosine)^5, the weight of grazing reflection in Schlick's Fresnel
-    approximation.
-    """
-    complement = (1 - cosine).clamp(0, 1)
-    square = complement * complement
-    return square * square * complement
-
-
-def _power(base: Tensor, exponent: Tensor) -> Tensor:
-    """Return base^exponent for base > 0, faster than torch.pow and accurate enough for images."""
-    return (base.log() * exponent).exp()
-
-
-def smith_ggx(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
-    """Return Smith's shadowing of the GGX distribution over 2 n.x: 1 / (n.x + sqrt(a^2 + (1 -
-    a^2)(n.x)^2)).
-    """
-    return 1 / (cosine + (alpha_squared + (1 - alpha_squared) * cosine * cosine).sqrt())

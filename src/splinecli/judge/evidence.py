@@ -1,5 +1,5 @@
-"""The input of the checks: a capture's lights, from files or arguments,
-and a sample of its pixels.
+"""The evidence that all checks share: a capture's lights, from files or arguments, a sample of its
+pixels, and what is fitted to them, once.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from splinecli.capture.light_rows import USUAL_FRAME, LightFrame
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.sample import Sample
 from splinecli.capture.source import Source
+from splinecli.judge.explanations import Doubt, Explanations, Kind
 from splinecli.judge.light_check import LightCheck, check_lights
 from splinecli.judge.odd_images import ImageShift, find_shifts
-from splinecli.judge.readings import Doubt, Kind, Readings
 from splinecli.judge.shading_shifts import moved_back, shading_shifts
 from splinecli.judge.summary import closeup_of, sample_observations
 from splinecli.lights.light_fit import Factors, find_factors
@@ -28,9 +28,11 @@ from splinecli.maths.robust import solve_each
 
 
 @dataclass(frozen=True, eq=False)
-class CaptureSample:
-    """F images and their lights, the input of the checks; results that several checks need are
-    computed once.
+class Evidence:
+    """F images and their lights, the input of the checks.
+
+    What several checks need, such as factors, the best explanation and shifts, is computed once,
+    when it is first asked for.
     """
 
     names: Sequence[str]
@@ -59,8 +61,8 @@ class CaptureSample:
     background: float = 0.0  # the share of dark background that was left out of the sample
 
     @classmethod
-    def of(cls, source: Source, capture: Capture, *, strict: bool = False) -> CaptureSample:
-        """Return the checks' input for a capture that was prepared from this source."""
+    def of(cls, source: Source, capture: Capture, *, strict: bool = False) -> Evidence:
+        """Return the evidence of a capture that was prepared from this source."""
         indices, measured = capture.light_indices, source.intensities_measured
         sample = sample_observations(capture.observations, capture.mask)
         if capture.estimated_intensities is not None:
@@ -130,13 +132,13 @@ class CaptureSample:
         return replace(self.sample, observations=self.observations / intensities)
 
     @cached_property
-    def readings(self) -> Readings:
+    def explanations(self) -> Explanations:
         """The sample as the files store it, to be read in other ways."""
         observations = (
             self.observations if self.intensities is None else self.observations * self.intensities
         )
         sample = replace(self.sample, observations=observations)
-        return Readings(sample, self.directions, self.intensities, eight_bit=self.eight_bit)
+        return Explanations(sample, self.directions, self.intensities, eight_bit=self.eight_bit)
 
     @cached_property
     def doubt(self) -> Doubt | None:
@@ -150,7 +152,7 @@ class CaptureSample:
             kinds.add("near")
         # Estimated intensities are divided out.
         accepted: set[Kind] = set() if self.estimated is None else {"intensities"}
-        return self.readings.likeliest(kinds, accepted=accepted)
+        return self.explanations.likeliest(kinds, accepted=accepted)
 
     @cached_property
     def light_check(self) -> LightCheck:
@@ -171,6 +173,12 @@ class CaptureSample:
         )
 
     def _check_of_moved(self, shifts: Sequence[ImageShift]) -> LightCheck:
+        key = tuple(shifts)
+        if key not in self._checks_of_moved:
+            self._checks_of_moved[key] = self._check_moved(shifts)
+        return self._checks_of_moved[key]
+
+    def _check_moved(self, shifts: Sequence[ImageShift]) -> LightCheck:
         known, values = moved_back(
             replace(self.sample, observations=self.observations), self._on_grid(shifts)
         )
@@ -180,6 +188,10 @@ class CaptureSample:
         return check_lights(
             values[known], mask, self.all_directions, self.indices, self.names, factors
         )
+
+    @cached_property
+    def _checks_of_moved(self) -> dict[tuple[ImageShift, ...], LightCheck]:
+        return {}
 
     def _on_grid(self, shifts: Sequence[ImageShift]) -> dict[int, tuple[int, int]]:
         step = self.sample.step
@@ -202,10 +214,11 @@ class CaptureSample:
             for place, (right, down) in of_shading.items()
         }
         together = [shifts[place] for place in sorted(shifts)]
+        # The check of moved images is needed anyway, the check as given seldom.
         if (
             not of_shading
-            or self._check_as_given.order is None
             or self._check_of_moved(together).order is None
+            or self._check_as_given.order is None
         ):
             return together
         return found  # the lights are in another order, so they cannot predict shading

@@ -1,0 +1,192 @@
+"""All commands prepare a capture alike: the same warnings and the same normals, whatever it is."""
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+from numpy.typing import NDArray
+
+import splinecli
+from scenes import (
+    BUMP_LAMPS,
+    Floats,
+    evaluate,
+    read_image,
+    shade,
+    sphere,
+    spiral_lights,
+    to_uint16,
+    write_bump,
+    write_capture,
+)
+from splinecli.estimate.methods.estimator import LeastSquares
+from splinecli.evaluation.protocol import Protocol
+from splinecli.maths.normals import angle_between_deg
+from splinecli.pipeline.infer import infer_capture
+from splinecli.pipeline.infer_options import InferOptions, InfoOptions, Reading
+from splinecli.pipeline.info import describe_capture
+
+Images = NDArray[np.uint16]
+LIGHTS = spiral_lights(12, 50, 15)
+NORMALS, MASK = sphere(64, 0.9)
+WHITE, TUNGSTEN = (1.0, 1.0, 1.0), (1.0, 0.75, 0.5)
+LAMPS = np.tile([WHITE, TUNGSTEN], (6, 1))
+
+
+def paint(*colours: tuple[float, float, float]) -> Floats:
+    """Stripes (H, W, 3) of these colours, with some texture."""
+    stripes = np.array(colours)[np.arange(64) // 8 % len(colours)]
+    grain = np.random.default_rng(1).uniform(0.8, 1, (64, 64, 1))
+    return np.asarray(stripes * cv2.GaussianBlur(grain, (0, 0), 1.0)[..., None])
+
+
+SOFT = paint((0.8, 0.5, 0.4), (0.5, 0.6, 0.8))
+STRONG = paint((0.9, 0.2, 0.1), (0.1, 0.3, 0.9))
+GRAY = paint(WHITE)
+
+
+def photograph(albedo: Floats, lamps: Floats | None = None, gloss: float = 0.0) -> Images:
+    """Return 16-bit images (F, H, W, 3) of the ball, of which the brightest value is at 60,000."""
+    lamps = np.ones((12, 3)) if lamps is None else lamps
+    shading = np.where(MASK[..., None], shade(NORMALS, LIGHTS, gloss=gloss), 0)
+    images = np.einsum("hwf,hwc,fc->fhwc", shading, albedo, lamps)
+    return to_uint16(images / images.max() * 60_000)
+
+
+def write(folder: Path, images: NDArray[np.generic], **more: NDArray[np.generic] | None) -> Path:
+    given = {"mask": MASK, "normals": NORMALS.astype(np.float32), **more}
+    return write_capture(folder, images, LIGHTS, **given)  # type: ignore[arg-type]
+
+
+def moved(images: Images) -> Images:
+    """Return the images, of which three are shifted by some pixels."""
+    found = images.copy()
+    for place, shift in ((2, (3, -2)), (5, (-2, 4)), (9, (4, 3))):
+        found[place] = np.roll(images[place], shift, axis=(0, 1))
+    return found
+
+
+def clipped(images: Images) -> Images:
+    return np.where(images > 30_000, 65_535, images * 2).astype(np.uint16)
+
+
+def eight_bits(images: Images) -> NDArray[np.uint8]:
+    return np.rint(images / 257).astype(np.uint8)
+
+
+def blurred(images: Images) -> Images:
+    return np.stack([cv2.GaussianBlur(image, (0, 0), 0.9) for image in images])
+
+
+def near_lamps(folder: Path) -> Path:
+    write_bump(folder)
+    rows = "\n".join(" ".join(map(str, lamp)) for lamp in BUMP_LAMPS)
+    (folder / "light_positions.txt").write_text(f"{rows}\n")
+    return folder
+
+
+STILL: dict[str, Callable[[Path], Path]] = {
+    "plain": lambda folder: write(folder, photograph(GRAY)),
+    "glossy": lambda folder: write(folder, photograph(GRAY, gloss=0.4)),
+    "coloured lamps": lambda folder: write(folder, photograph(SOFT, LAMPS)),
+    "strongly coloured object": lambda folder: write(folder, photograph(STRONG, LAMPS)),
+    "unequal lamps": lambda folder: write(
+        folder, photograph(GRAY, np.linspace(0.6, 1, 12)[:, None].repeat(3, axis=1))
+    ),
+    "RGB intensities": lambda folder: write(folder, photograph(SOFT, LAMPS), intensities=LAMPS),
+    "saturated": lambda folder: write(folder, clipped(photograph(GRAY))),
+    "dark": lambda folder: write(folder, (photograph(GRAY) // 40).astype(np.uint16)),
+    "8 bits": lambda folder: write(folder, eight_bits(photograph(GRAY))),
+    "blurred": lambda folder: write(folder, blurred(photograph(GRAY))),
+    "gray images": lambda folder: write(folder, photograph(GRAY)[..., 0]),
+    "without mask": lambda folder: write(folder, photograph(GRAY), mask=None),
+    "near lamps": near_lamps,
+}
+OTHERS: dict[str, Callable[[Path], Path]] = {
+    "moved": lambda folder: write(folder, moved(photograph(GRAY))),
+    "moved under coloured lamps": lambda folder: write(folder, moved(photograph(SOFT, LAMPS))),
+    "black image": lambda folder: write(
+        folder, photograph(GRAY, np.repeat(np.arange(12)[:, None] != 3, 3, axis=1) * 1.0)
+    ),
+}
+
+
+def reading_of(name: str) -> dict[str, object]:
+    """Return the options that a capture needs to be read."""
+    return {"pixel_size": 2.0} if name == "near lamps" else {}
+
+
+@pytest.mark.parametrize("auto_mask", [False, True], ids=["", "auto-mask"])
+@pytest.mark.parametrize("name", [*STILL, *OTHERS])
+def test_infer_and_info_give_the_same_warnings(tmp_path, name, auto_mask):
+    folder = (STILL | OTHERS)[name](tmp_path / "capture")
+    options = InferOptions(
+        method="ls", output=str(tmp_path), auto_mask=auto_mask, **reading_of(name)
+    )
+    report = infer_capture(folder, options)
+    reading = Reading(**reading_of(name))
+    info = describe_capture(InfoOptions(capture=folder, auto_mask=auto_mask), reading)
+    assert info["warnings"] == [warning["text"] for warning in report["warnings"]]
+    assert info["warning_codes"] == [warning["code"] for warning in report["warnings"]]
+    assert info["n_pixels"] == report["n_pixels"]
+
+
+@pytest.mark.parametrize("name", [*STILL, *OTHERS])
+def test_infer_and_evaluate_give_the_same_error(tmp_path, name):
+    if reading_of(name):
+        pytest.skip("evaluate has no options of reading")
+    folder = (STILL | OTHERS)[name](tmp_path / "capture")
+    report = infer_capture(folder, InferOptions(method="ls", output=str(tmp_path)))
+    (result,) = evaluate([folder], [LeastSquares()], Protocol(None)).results
+    assert result.mae_deg == pytest.approx(
+        report["angular_error_deg"]["mean"], abs=1e-3
+    )  # as rounded in the report
+
+
+@pytest.mark.parametrize("name", [name for name in STILL if name not in ("8 bits", "near lamps")])
+def test_files_and_arrays_give_the_same_normals(tmp_path, name):
+    folder = STILL[name](tmp_path / "capture")
+    infer_capture(folder, InferOptions(method="ls", output=str(tmp_path)))
+    paths = sorted(folder.glob("[0-9]*.png"))
+    images = [read_image(path) for path in paths]
+    stack = np.stack([image if image.ndim == 2 else image[..., ::-1] for image in images])
+    known = LAMPS if name == "RGB intensities" else None
+    mask = None if name == "without mask" else MASK
+    lights = np.loadtxt(folder / "light_directions.txt")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # that infer prints
+        estimate = splinecli.estimate_normals(
+            stack, lights, mask, light_intensities=known, method="ls"
+        )
+    normals = np.load(tmp_path / "capture" / "normals.npy")
+    assert_array_equal(estimate.normal_map, normals)
+
+
+@pytest.mark.parametrize("name", ["plain", "coloured lamps", "strongly coloured object", "blurred"])
+def test_aligning_a_still_capture_changes_nothing(tmp_path, name):
+    folder = STILL[name](tmp_path / "capture")
+    found, warned = [], []
+    for align in (False, True):
+        options = InferOptions(method="ls", output=str(tmp_path), align=align)
+        report = infer_capture(folder, options)
+        warned.append(report["warnings"])
+        found.append(np.load(tmp_path / "capture" / "normals.npy"))
+    assert warned[0] == warned[1]
+    assert_array_equal(*found)
+
+
+def test_coloured_lamps_leave_nothing_but_their_warning(tmp_path):
+    """The pixels near the middle have no attached shadows, so least squares is exact there."""
+    folder = STILL["strongly coloured object"](tmp_path / "capture")
+    inside = cv2.circle(np.zeros((64, 64), np.uint8), (32, 32), 17, 1, cv2.FILLED) > 0
+    for align in (False, True):
+        options = InferOptions(method="ls", output=str(tmp_path), align=align, strict=True)
+        report = infer_capture(folder, options)
+        codes = {warning["code"] for warning in report["warnings"]}
+        assert codes == {"estimated_colours", "estimated_intensities"}
+        normals = np.load(tmp_path / "capture" / "normals.npy")
+        assert angle_between_deg(normals[inside], NORMALS[inside]).mean() < 0.1
