@@ -108,7 +108,7 @@ class Bench:
                 light_noise_deg=(0.0, 4.0, 8.0),
                 refine_lights=refine,
             )
-            cells |= means(found, lambda r, how=how: f"{r['light_noise_deg']:g} {how}")  # type: ignore[misc]
+            cells |= means(found, lambda r, how=how: f"{r['light_noise_deg']:g} {how}")
         return cells
 
     def eight_bits(self, convert: Callable[[Any], Any], name: str) -> Cells:
@@ -366,7 +366,7 @@ class Bench:
 def each(measure: Callable[[], dict[str, Cells]], names: Sequence[str]) -> Rows:
     """Return rows that come from one measurement, which is made once."""
     once = cache(measure)
-    return {name: lambda name=name: once()[name] for name in names}  # type: ignore[misc]
+    return {name: lambda name=name: once()[name] for name in names}
 
 
 def means(

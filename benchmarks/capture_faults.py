@@ -72,7 +72,9 @@ def render(index: int) -> Iterator[Rendered]:
         normals = field.vertex_normals / field.vertex_normals[:, 2:] * (steepness, steepness, 1)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         mesh = Mesh(
-            field.vertices * np.float32((1, 1, steepness)), field.faces, normals.astype(np.float32)
+            field.vertices * np.float32((1, 1, steepness)),  # type: ignore[operator]
+            field.faces,
+            normals.astype(np.float32),
         )
     config = SceneConfig(size=SIZE, lights=4)
     scene = draw_scene(SEED, index, config, mesh)

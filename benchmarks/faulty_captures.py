@@ -323,7 +323,7 @@ class Recorder:
 
     def refine(
         self, mask, observations, lighting_at: LightingAt, normals, errors, *, progress=None
-    ) -> None:  # type: ignore[no-untyped-def]
+    ) -> None:
         light = lighting_at(np.arange(len(normals)))
         self.before = normals.copy(), errors.copy()
         self._refiner.refine(mask, observations, lighting_at, normals, errors, progress=progress)
@@ -343,7 +343,7 @@ def store_captures(
 ) -> None:
     torch.set_num_threads(1)
     estimator = make_estimator("spline-net")
-    recorder = estimator.refiner = Recorder(estimator.refiner)  # type: ignore[assignment,arg-type]
+    recorder = estimator.refiner = Recorder(estimator.refiner)  # type: ignore[assignment]
     for index in scenes:
         if (folder / f"{index:05d}.done").exists():
             continue

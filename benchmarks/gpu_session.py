@@ -70,7 +70,8 @@ SIZES = {
 def machine() -> Row:
     """Return versions and hardware."""
     import torch
-    from splinecli.system.devices import choose_precision
+
+    from splinecli.system.machine import choose_precision
 
     installed = {each.name: each.version for each in metadata.distributions()}
     found: Row = {
@@ -164,13 +165,13 @@ def train_steps(
     numbers. Captures are always photographed with the processor's.
     """
     import torch
-    from splinecli.system.devices import choose_device
 
+    from splinecli.system.machine import choose_device
     from splinecli.workshop.training import tasks
     from splinecli.workshop.training.config import configure
     from splinecli.workshop.training.loop import Trainer
 
-    tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES = size.captures, 1
+    tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES = size.captures, 1  # type: ignore[attr-defined]
     config, place = configure(preset, None, list(changes)), choose_device(device)
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(config, Path(folder), place)
@@ -233,9 +234,9 @@ def train(pixel_set: str, run: str, device: str, ends: float, capture_seconds: f
     def minutes_left() -> float:
         return max(0.05, (ends - SPARE_SECONDS - time.time()) / 60)
 
-    usual, held = tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES
+    usual, held = tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES  # type: ignore[attr-defined]
     share = min(1.0, 60 * minutes_left() / 2 / (capture_seconds * (usual + held)))
-    tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES = (
+    tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES = (  # type: ignore[attr-defined]
         max(1, round(share * number)) for number in (usual, held)
     )
     config = configure("refine", None, [{"sources": {pixel_set: 1.0}, "minutes": minutes_left()}])
@@ -246,7 +247,7 @@ def train(pixel_set: str, run: str, device: str, ends: float, capture_seconds: f
         trainer.config = dataclasses.replace(config, minutes=minutes_left())
         last = trainer.run()
     assert last is not None
-    found = {"first_captures": tasks.FIRST_EXAMPLES, "training_minutes": trainer.config.minutes}
+    found = {"first_captures": tasks.FIRST_EXAMPLES, "training_minutes": trainer.config.minutes}  # type: ignore[attr-defined]
     return {**found, **dataclasses.asdict(last), "peak_gpu_mib": peak_gpu_mib()}
 
 

@@ -102,8 +102,10 @@ def picture_of(size: int, depth: float, method: str) -> bytes:
         images, _ = photograph(size, kind, depth, 200)
         maps = maps_of(images, method)
         photo = np.rint(255 * (images[0] / images[0].max()) ** (1 / 2.2)).astype(np.uint8)
-        curvature = signed_picture(maps["curvature"], 0.02)
-        rows.append(np.hstack((photo, signed_picture(maps["relief"], 0.5), curvature)))
+        everywhere = np.ones(photo.shape, np.bool_)
+        curvature = signed_picture(maps["curvature"], everywhere, 0.02)
+        relief = signed_picture(maps["relief"], everywhere, 0.5)
+        rows.append(np.hstack((photo, relief, curvature)))
     return encode_png(np.vstack(rows))
 
 

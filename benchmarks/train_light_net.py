@@ -213,7 +213,7 @@ def losses(
 
 def train(folder: Path, minutes: float, output: Path) -> None:
     """Train for so many minutes, and write the running average of the weights."""
-    network, average = LightNet().to(memory_format=torch.channels_last), LightNet()  # type: ignore[call-overload]
+    network, average = LightNet().to(memory_format=torch.channels_last), LightNet()
     optimiser = torch.optim.AdamW(
         network.parameters(), RATE, betas=(0.9, 0.99), weight_decay=1e-3, fused=True
     )

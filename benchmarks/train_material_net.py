@@ -14,7 +14,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from safetensors.torch import load_file, save_file
@@ -133,7 +133,7 @@ def forward(network: MaterialNet, batch: Batch) -> Gloss:
     """Return the network's prediction for a batch."""
     pixels = batch.pixels._replace(tokens=batch.pixels.tokens.float())
     found, _ = network(pixels, torch.ones(CAPTURES))
-    return found  # type: ignore[no-any-return]
+    return found
 
 
 def loss_of(found: Gloss, targets: Tensor) -> Tensor:
@@ -187,7 +187,7 @@ def train(folder: Path, steps: int) -> MaterialNet:
             kept = min(0.995, step / (step + 10))
             torch._foreach_lerp_(list(average.parameters()), list(network.parameters()), 1 - kept)
         if (step + 1) % 500 == 0:
-            parts = {"network": network, "average": average, "optimiser": optimiser}
+            parts: dict[str, Any] = {"network": network, "average": average, "optimiser": optimiser}
             torch.save(
                 {name: part.state_dict() for name, part in parts.items()} | {"step": step + 1},
                 checkpoint,

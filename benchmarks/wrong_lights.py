@@ -52,7 +52,7 @@ def wrong_files(
     yield "right", lights, lambda check: True
     for name, frame in FRAMES.items():
         inverse = np.linalg.inv(parse_light_frame(frame).matrix)
-        yield name, lights @ inverse.T, lambda check, frame=frame: mends(check, frame)  # type: ignore[misc]
+        yield name, lights @ inverse.T, lambda check, frame=frame: mends(check, frame)
     yield (
         "shifted by one",
         np.roll(lights, 1, axis=0),

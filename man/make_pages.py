@@ -1,5 +1,5 @@
-"""Make the man pages and docs/reports.schema.json from the commands and documents: `python
-man/make_pages.py`.
+"""Make the man pages and docs/reports.schema.json from the commands and documents;
+docs/generate.py runs this with the other generators.
 """
 
 import inspect

@@ -12,10 +12,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from browser import browser, open_page
-from scenes import cap_directions, directions_at, shade, spiral_lights
+from scenes import Floats, cap_directions, directions_at, shade, spiral_lights
 from small_pixel_sets import make_set
 from splinecli.system.progress import STAGES
 
@@ -57,7 +56,7 @@ def shared_data() -> Path:
 
 
 @pytest.fixture
-def matte_pixels() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def matte_pixels() -> tuple[Floats, Floats, Floats]:
     """Normals (200, 3), 12 lights and observations (200, 12) of matte pixels,
     no shadow among them.
     """
@@ -67,7 +66,7 @@ def matte_pixels() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np
 
 
 @pytest.fixture
-def glossy_pixels() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def glossy_pixels() -> tuple[Floats, Floats, Floats]:
     """Normals (60, 3), 14 lights and observations (60, 14): Lambert's cosine, a Phong lobe,
     attached shadows.
     """

@@ -13,7 +13,7 @@ N = 20_000
 SHARE = 0.015
 
 
-def generator(seed: int = 0) -> torch.Generator:
+def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 

@@ -1,5 +1,6 @@
 """Lights, shapes and captures of known normals, which the tests of many rooms share."""
 
+import json
 import struct
 import zlib
 from dataclasses import dataclass
@@ -87,6 +88,25 @@ def shade(
     return np.asarray(np.clip(seen, 0, None))
 
 
+def to_uint16(values: NDArray[Any]) -> NDArray[np.uint16]:
+    """Round values to those that a 16-bit image stores."""
+    return np.rint(values).astype(np.uint16)
+
+
+def read_image(path: str | Path) -> Any:
+    """The pixels of an image as OpenCV reads them: BGR, in their own type."""
+    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+
+
+def write_image(path: str | Path, pixels: NDArray[Any]) -> None:
+    """Write pixels (H, W) or (H, W, 3) BGR in the format of the name."""
+    assert cv2.imwrite(str(path), pixels)
+
+
+def read_json(path: str | Path) -> Any:
+    return json.loads(Path(path).read_text("utf-8"))
+
+
 def write_capture(
     folder: Path,
     images: NDArray[np.generic],
@@ -104,11 +124,11 @@ def write_capture(
     folder.mkdir(parents=True, exist_ok=True)
     for number, image in enumerate(images, start=first):
         stored = image if image.ndim == 2 else image[..., ::-1]
-        assert cv2.imwrite(str(folder / names.format(number)), stored)
+        write_image(folder / names.format(number), stored)
     if lights is not None:
         np.savetxt(folder / "light_directions.txt", lights, fmt="%.9f")
     if mask is not None:
-        assert cv2.imwrite(str(folder / "mask.png"), mask.astype(np.uint8) * 255)
+        write_image(folder / "mask.png", mask.astype(np.uint8) * 255)
     if normals is not None:
         np.save(folder / "normals_gt.npy", normals)
     if intensities is not None:
@@ -167,7 +187,7 @@ def write_bump(folder: Path, positions: Floats = BUMP_LAMPS, *, distant: bool = 
     distance = np.linalg.norm(towards, axis=3)
     shading = np.clip((towards * normals).sum(axis=3) / distance, 0, None)
     pictures = shading * (1 if distant else 150.0**2 / distance**2)
-    stored = np.rint(pictures * 30_000).astype(np.uint16)
+    stored = to_uint16(pictures * 30_000)
     return write_capture(
         folder, stored, None, normals=normals.astype(np.float32), names="{}.png", first=1
     )

@@ -1,7 +1,6 @@
 """Each benchmark runs to its end on small inputs and prints every row."""
 
 import importlib
-import json
 import math
 import re
 import time
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from small_pixel_sets import MakeSet
+from scenes import read_json
 from splinecli import __version__
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
@@ -66,13 +65,13 @@ SPEEDS = {
 
 
 @pytest.mark.parametrize("command", SPEEDS)
-def test_speeds(run: Run, command: str) -> None:
+def test_speeds(run, command):
     printed = run(*command.split()).splitlines()[1:]
     assert all(line.startswith(name) for line, name in zip(printed, SPEEDS[command], strict=True))
     assert all(min(numbers(line[25:])) > 0 for line in printed)
 
 
-def test_photographs(run: Run) -> None:
+def test_photographs(run):
     printed = run("photographs", MEDALLION, "--draws", "1", "--pixels", "60")
     overexposed, intensities = printed.split("\n\n")
     assert len(numbers(overexposed.splitlines()[1])) == 4
@@ -80,7 +79,7 @@ def test_photographs(run: Run) -> None:
 
 
 @pytest.mark.usefixtures("coarse_shapes")
-def test_faulty_captures(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_faulty_captures(run, tmp_path, monkeypatch):
     pytest.importorskip("embreex", reason="needs the extra 'render'")
     monkeypatch.setattr("fit_capture_confidence.STEPS", 20)
     printed = run("faulty_captures", str(tmp_path), "--scenes", "5", "--size", "24")
@@ -91,7 +90,7 @@ def test_faulty_captures(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert all(len(numbers(row)) == 8 for row in rows[2:])
 
 
-def test_faulty_captures_of_pixel_sets(run: Run, make_set: MakeSet, tmp_path: Path) -> None:
+def test_faulty_captures_of_pixel_sets(run, make_set, tmp_path):
     folder = str(make_set(entries=[("a", "one", 400, 30)]).folder)
     run(
         "faulty_captures",
@@ -114,7 +113,7 @@ def test_faulty_captures_of_pixel_sets(run: Run, make_set: MakeSet, tmp_path: Pa
 
 
 @pytest.mark.usefixtures("coarse_shapes")
-def test_render_accuracy(run: Run) -> None:
+def test_render_accuracy(run):
     pytest.importorskip("mitsuba", reason="compares with Mitsuba 3")
     pytest.importorskip("embreex", reason="needs the extra 'render'")
     arguments = ("--size", "12", "--samples", "4", "--scenes", "1", "--directions", "4")
@@ -124,7 +123,7 @@ def test_render_accuracy(run: Run) -> None:
 
 
 @pytest.mark.usefixtures("coarse_shapes")
-def test_near_lamps(run: Run) -> None:
+def test_near_lamps(run):
     pytest.importorskip("embreex", reason="needs the extra 'render'")
     printed = run(
         "near_lamps", "--size", "16", "--method", "ls", "--widths", "4", "--off", "0.8"
@@ -137,7 +136,7 @@ def test_near_lamps(run: Run) -> None:
     assert distant < 1 > distant_range
 
 
-def test_inspection(run: Run) -> None:
+def test_inspection(run):
     printed = run(
         "inspection", "--size", "96", "--plates", "1", "--depths", "0.5", "--method", "ls"
     ).splitlines()
@@ -147,7 +146,7 @@ def test_inspection(run: Run) -> None:
     ]
 
 
-def test_large_captures(run: Run, tmp_path: Path) -> None:
+def test_large_captures(run, tmp_path):
     plot = tmp_path / "plot.png"
     arguments = ("--megapixels", "0.001", "--method", "ls", "--plot", str(plot))
     header, row = run("large_captures", *arguments).splitlines()
@@ -157,7 +156,7 @@ def test_large_captures(run: Run, tmp_path: Path) -> None:
     assert plot.stat().st_size > 1000
 
 
-def test_gpu_session(tmp_path: Path) -> None:
+def test_gpu_session(tmp_path):
     """A step that fails, or has no time left, is reported, and the others go on."""
     module = importlib.import_module("gpu_session")
     session = module.Session(tmp_path, tmp_path, time.time() + 60)
@@ -177,11 +176,11 @@ def test_gpu_session(tmp_path: Path) -> None:
         and "FileNotFoundError" in report
         and "there is no time left" in report
     )
-    steps = [entry["step"] for entry in json.loads((tmp_path / "report.json").read_text())]
+    steps = [entry["step"] for entry in read_json(tmp_path / "report.json")]
     assert steps == ["apart", "missing", "late"]
 
 
-def test_all_figures(run: Run, tmp_path: Path) -> None:
+def test_all_figures(run, tmp_path):
     """A row is stored with what it was measured with, and is not measured again."""
     for name in ("ballPNG", "catPNG", "readingPNG"):
         place = tmp_path / "data/DiLiGenT/pmsData" / name
@@ -197,7 +196,7 @@ def test_all_figures(run: Run, tmp_path: Path) -> None:
     )
     arguments = (*places, "--trials", "2", "--only", "noise/ls")
     assert run("all_figures", *arguments).startswith("noise, ls: ")
-    measured = json.loads(stored.read_text())["noise"]
+    measured = read_json(stored)["noise"]
     assert (measured["version"], len(measured["weights"])) == (__version__, 8)
     assert list(measured["rows"]) == ["ls"]
     assert list(measured["rows"]["ls"]) == ["0", "2", "4", "8"]
@@ -205,7 +204,7 @@ def test_all_figures(run: Run, tmp_path: Path) -> None:
     assert run("all_figures", *arguments) == ""
 
 
-def test_wrong_lights(run: Run) -> None:
+def test_wrong_lights(run):
     rows = run("wrong_lights", MEDALLION, "--scenes", "0", "--draws", "1").splitlines()
     cells = dict(
         row.strip("| ").split(" | ") for row in rows if row.count("|") == 3 and "---" not in row
@@ -216,7 +215,7 @@ def test_wrong_lights(run: Run) -> None:
     assert sum(cell == "1 / 1 of 1" for cell in cells.values()) >= 8
 
 
-def test_measured_spheres(run: Run, shared_data: Path, tmp_path: Path) -> None:
+def test_measured_spheres(run, shared_data, tmp_path):
     """Trained weights are better on measured materials than a network without training, which is a
     Lambertian fit.
     """
@@ -231,7 +230,7 @@ def test_measured_spheres(run: Run, shared_data: Path, tmp_path: Path) -> None:
     assert trained < 0.7 * fit
 
 
-def test_measured_materials_are_those_of_explicit_vectors(tmp_path: Path) -> None:
+def test_measured_materials_are_those_of_explicit_vectors(tmp_path):
     random = np.random.default_rng(0)
     shapes = {
         "W1": (3, 6, 5),
@@ -282,7 +281,7 @@ def _brdf(arrays: dict[str, Any], material: int, n: Any, light: Any) -> float:
 
 
 @pytest.mark.usefixtures("coarse_shapes")
-def test_materials(run: Run) -> None:
+def test_materials(run):
     pytest.importorskip("embreex", reason="needs the extra 'render'")
     printed = run("materials", "--scenes", "1", "--size", "16", "--sets", "metallic").splitlines()
     assert "material" in printed[0]

@@ -1,7 +1,6 @@
 """The documentation agrees with the code: links, commands, constants and tables of figures."""
 
 import doctest
-import json
 import re
 import shlex
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ import typer
 import figure_plots
 import figure_tables
 import splinecli
+from scenes import read_json
 from splinecli.cli.main import app
 from splinecli.errors import InputError, ModelError, OutputError, UsageError
 
@@ -187,7 +187,7 @@ def test_tables_of_figures(name):
     """Each table says what docs/figures.json says. `python benchmarks/figure_tables.py` writes
     them.
     """
-    measured = json.loads(figure_tables.FIGURES.read_text("utf-8"))
+    measured = read_json(figure_tables.FIGURES)
     text = text_of(name)
     assert text == figure_tables.fill(text, measured, figure_tables.shipped_weights())
     assert text.count("<!-- figures: ") == text.count("<!-- end -->") > 0

@@ -12,10 +12,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
+from scenes import read_image
 from splinecli.cli.main import main
 from splinecli.estimate.inference import estimate_normals
 from splinecli.estimate.methods import make_estimator
@@ -30,7 +31,7 @@ ONE_COUNT = 1
 
 
 def read_png(path: Path) -> Any:
-    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    pixels = read_image(path)
     return pixels[..., ::-1] if pixels.ndim == 3 else pixels
 
 
@@ -100,14 +101,12 @@ def test_the_stored_capture_is_what_the_script_renders(script):
         stored = read_png(MEDALLION / f"{number:02d}.png")
         assert (stored.dtype, stored.shape) == (np.uint16, image.shape)
         assert counts_apart(stored, image) <= ONE_COUNT, f"image {number}"
-    np.testing.assert_array_equal(read_png(MEDALLION / "mask.png") == 255, rendering.mask)
+    assert_array_equal(read_png(MEDALLION / "mask.png") == 255, rendering.mask)
     stored = read_png(MEDALLION / "normals_gt.png")
     assert counts_apart(stored, encode_picture(rendering.normals, rendering.mask)) <= ONE_COUNT
     directions = np.loadtxt(MEDALLION / "light_directions.txt")
     np.testing.assert_allclose(directions, rendering.light_directions, rtol=0, atol=1.1e-6)
-    np.testing.assert_array_equal(
-        np.loadtxt(MEDALLION / "light_intensities.txt"), rendering.light_intensities
-    )
+    assert_array_equal(np.loadtxt(MEDALLION / "light_intensities.txt"), rendering.light_intensities)
 
 
 def test_nothing_is_saturated_and_nothing_is_warned_about():

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
+from scenes import read_json
+
 EXAMPLE = Path(__file__).parents[1] / "examples/normal_maps_for_meshroom.py"
 # A camera along the world's x axis: its x is the world's -y, its y (down) the world's -z, and its z
 # the world's x.
@@ -55,26 +57,23 @@ CAMERAS = {
 }
 
 
-def test_normals_reach_the_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_normals_reach_the_world(tmp_path, capsys):
     exr = pytest.importorskip("OpenEXR")
     normals = np.zeros((3, 4, 3), np.float32)
     # one towards the camera, one also to its right
-    normals[1, 1], normals[1, 2] = (
-        (0, 0, 1),
-        (0.6, 0.0, 0.8),
-    )
+    normals[1, 1], normals[1, 2] = ((0, 0, 1), (0.6, 0.0, 0.8))
     (tmp_path / "ps_cat").mkdir()
     np.save(tmp_path / "ps_cat/normals.npy", normals)
     (tmp_path / "cameras.sfm").write_text(json.dumps(CAMERAS))
     main = runpy.run_path(str(EXAMPLE))["main"]
     main(tmp_path / "cameras.sfm", tmp_path / "maps", [tmp_path / "ps_cat"])
-    written = json.loads((tmp_path / "maps/normalMaps.sfm").read_text())
+    written = read_json(tmp_path / "maps/normalMaps.sfm")
     assert written["views"] == [
-        {**CAMERAS["views"][1], "path": str(tmp_path / "maps/12_normals_w.exr")}
+        {**CAMERAS["views"][1], "path": str(tmp_path / "maps/12_normals_w.exr")}  # type: ignore[index]
     ]
     assert (written["poses"], written["intrinsics"]) == (CAMERAS["poses"], CAMERAS["intrinsics"])
 
-    def read(name: str) -> np.ndarray:
+    def read(name):
         pixels = exr.File(str(tmp_path / "maps" / name)).channels()["RGB"].pixels
         return np.asarray(pixels)[1, 1:3]
 

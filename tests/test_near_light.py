@@ -6,27 +6,27 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 import splinecli
-from scenes import spiral_lights
+from scenes import Floats, Mask, spiral_lights
 from splinecli.capture import Capture
 from splinecli.capture.linearise import Window
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.errors import InputError, UsageError
 from splinecli.estimate import inference
-from splinecli.estimate.inference import Blocks, estimate_normals, find_surface
+from splinecli.estimate.inference import estimate_normals, find_surface
 from splinecli.estimate.methods import make_estimator
 from splinecli.maths.normals import unit
-from splinecli.maths.pixel_grid import pixel_rays
+from splinecli.maths.pixel_grid import Blocks, pixel_rays
 
-Floats = NDArray[np.float64]
 SIDE = 40
 LIGHTS = spiral_lights(10, 50, 20)
 MATRIX = np.array([(60.0, 0, 20.5), (0, 60.0, 18.0), (0, 0, 1)])
 
 
-def surface(kind: str, side: int = SIDE) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def surface(kind: str, side: int = SIDE) -> tuple[Floats, Floats, Mask]:
     """Return points (P, 3) with a mean height of 0 in a frame that is 2 wide, normals (P, 3) and
     the mask.
     """
@@ -47,7 +47,7 @@ def surface(kind: str, side: int = SIDE) -> tuple[Floats, Floats, NDArray[np.boo
 
 
 def capture_of(
-    points: Floats, normals: Floats, mask: NDArray[np.bool_], positions: Floats, strengths: Floats
+    points: Floats, normals: Floats, mask: Mask, positions: Floats, strengths: Floats
 ) -> Capture:
     towards = positions - points[:, None]
     distance = np.linalg.norm(towards, axis=2)
@@ -71,7 +71,7 @@ def error_deg(capture: Capture) -> float:
 
 
 @pytest.mark.parametrize(("kind", "limit_deg"), [("plane", 0.001), ("tilted", 0.02), ("dome", 0.2)])
-def test_lamps_at_two_widths(kind: str, limit_deg: float) -> None:
+def test_lamps_at_two_widths(kind, limit_deg):
     """Exact data give exact normals, apart from the integration, whose error is that of a grid of
     40 x 40 pixels.
     """
@@ -80,7 +80,7 @@ def test_lamps_at_two_widths(kind: str, limit_deg: float) -> None:
     assert error_deg(replace(capture, lamps=None)) > 10
 
 
-def test_the_surface_is_found_in_the_unit_of_the_positions() -> None:
+def test_the_surface_is_found_in_the_unit_of_the_positions():
     lamps = NearLamps.of(500 * 4.0 * LIGHTS, 1000 / SIDE, (SIDE, SIDE), equal=True)
     in_millimetres = replace(near("dome", 4.0), lamps=lamps)
     lamps = find_surface(in_millimetres).lamps
@@ -90,7 +90,7 @@ def test_the_surface_is_found_in_the_unit_of_the_positions() -> None:
     assert find_surface(find_surface(in_millimetres)).lamps is not lamps
 
 
-def test_intensities_hold_at_the_origin() -> None:
+def test_intensities_hold_at_the_origin():
     """Lamps of unequal distances: as of equal lamps, or with the intensities that a gray card at
     the origin shows.
     """
@@ -105,7 +105,7 @@ def test_intensities_hold_at_the_origin() -> None:
 
 
 @pytest.mark.parametrize("equal", [True, False])
-def test_lamps_that_shine_in_lobes(equal: bool) -> None:
+def test_lamps_that_shine_in_lobes(equal):
     """LEDs that miss the middle of the object by up to 30 degrees, of equal power or measured at
     the origin.
     """
@@ -114,7 +114,7 @@ def test_lamps_that_shine_in_lobes(equal: bool) -> None:
     axes = unit(0.4 * np.random.default_rng(0).normal(size=(10, 3)) - LIGHTS)
     exponents = np.linspace(0, 6, 10)
 
-    def strengths(places: Floats) -> Floats:
+    def strengths(places):
         rays = unit(places[:, None] - positions)
         return np.einsum("pfc,fc->pf", rays, axes).clip(0) ** exponents
 
@@ -128,7 +128,7 @@ def test_lamps_that_shine_in_lobes(equal: bool) -> None:
     assert error_deg(replace(capture, lamps=replace(lamps, lobes=None))) > 2
 
 
-def test_a_perspective_camera() -> None:
+def test_a_perspective_camera():
     """A tilted plane before a pinhole camera: points on the rays, and a highlight-free surface."""
     mask = np.ones((SIDE, SIDE), np.bool_)
     rays = pixel_rays(mask, MATRIX)
@@ -168,7 +168,7 @@ def glossy_sphere(half_angle_deg: float, *, gloss: float = 1.0, side: int = 32) 
     return Capture("sphere", seen, LIGHTS, tuple(range(10)), mask, truth, camera_matrix=matrix)
 
 
-def test_the_shipped_network_sees_gloss_from_a_near_camera() -> None:
+def test_the_shipped_network_sees_gloss_from_a_near_camera():
     """Refined, too: without the camera, the highlights are where an orthographic one would not see
     them.
     """
@@ -179,25 +179,25 @@ def test_the_shipped_network_sees_gloss_from_a_near_camera() -> None:
     assert found.errors.mean < 0.6 * without.errors.mean
 
 
-def test_least_squares_does_not_depend_on_the_camera() -> None:
+def test_least_squares_does_not_depend_on_the_camera():
     capture, estimator = glossy_sphere(20), make_estimator("ls")
     maps = [
         estimate_normals(each, estimator).normal_map
         for each in (capture, replace(capture, camera_matrix=None))
     ]
-    np.testing.assert_allclose(*maps, atol=1e-4)
+    assert_allclose(*maps, atol=1e-4)
     matte = estimate_normals(glossy_sphere(20, gloss=0), make_estimator("iw12"))
     assert matte.errors.median < 0.1  # shadows at the rim
 
 
-def test_a_camera_far_away_is_orthographic() -> None:
+def test_a_camera_far_away_is_orthographic():
     """At this focal length, rays differ by 0.002 degrees."""
     capture, estimator = glossy_sphere(0.001, side=20), make_estimator("spline-net-pixelwise")
     maps = [
         estimate_normals(each, estimator).normal_map
         for each in (capture, replace(capture, camera_matrix=None))
     ]
-    np.testing.assert_allclose(*maps, atol=2e-3)
+    assert_allclose(*maps, atol=2e-3)
 
 
 def images_of(capture: Capture) -> NDArray[np.float32]:
@@ -206,14 +206,14 @@ def images_of(capture: Capture) -> NDArray[np.float32]:
     return images
 
 
-def test_the_python_door_takes_a_camera() -> None:
+def test_the_python_door_takes_a_camera():
     capture = glossy_sphere(20, side=16)
     arguments = images_of(capture), LIGHTS, capture.mask
     found = splinecli.estimate_normals(
         *arguments, camera_matrix=capture.camera_matrix, method="st14"
     )
     expected = estimate_normals(capture, make_estimator("st14")).normal_map
-    np.testing.assert_allclose(found.normal_map, expected, atol=1e-5)
+    assert_allclose(found.normal_map, expected, atol=1e-5)
     assert (
         np.abs(splinecli.estimate_normals(*arguments, method="st14").normal_map - expected).max()
         > 0.01
@@ -226,9 +226,7 @@ def test_the_python_door_takes_a_camera() -> None:
 @pytest.mark.parametrize(
     ("kind", "box", "limit_deg"), [("dome", None, 0.3), ("plane", (41, 3, 37, 50), 0.001)]
 )
-def test_a_part_of_the_images(
-    kind: str, box: tuple[int, int, int, int] | None, limit_deg: float
-) -> None:
+def test_a_part_of_the_images(kind, box, limit_deg):
     """Every second row and column, and a box that lies off the middle of the images."""
     capture = near(kind, 4.0, side=2 * SIDE)
     window = Window(box, 2, capture.mask.shape)
@@ -242,7 +240,7 @@ def test_a_part_of_the_images(
     assert error_deg(part) < limit_deg
 
 
-def test_large_captures_are_found_at_a_reduced_size(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_captures_are_found_at_a_reduced_size(monkeypatch):
     capture = near("dome", 4.0, side=101)
     whole = find_surface(capture).lamps
     monkeypatch.setattr(inference, "PIXELS_ON_THE_WAY", 900)
@@ -252,9 +250,9 @@ def test_large_captures_are_found_at_a_reduced_size(monkeypatch: pytest.MonkeyPa
     assert error_deg(capture) < 0.2
 
 
-def test_the_python_door_takes_positions() -> None:
+def test_the_python_door_takes_positions():
     capture = near("dome", 4.0)
     arguments = images_of(capture), LIGHTS * 4.0, capture.mask
     estimate = splinecli.estimate_normals(*arguments, pixel_size=2 / SIDE, method="iw12")
     expected = estimate_normals(capture, make_estimator("iw12"))
-    np.testing.assert_allclose(estimate.normal_map, expected.normal_map, atol=1e-5)
+    assert_allclose(estimate.normal_map, expected.normal_map, atol=1e-5)

@@ -1,6 +1,5 @@
 """The functions for notebooks: the same normals as `splinecli infer`, from arrays."""
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 import splinecli
+from scenes import read_image, read_json, write_image
 from splinecli.capture.arrays import open_arrays
 from splinecli.cli.main import main
 from splinecli.errors import InputError, UsageError
@@ -25,10 +25,7 @@ def read_medallion(folder: Path = MEDALLION) -> tuple[NDArray[Any], ...]:
     """Images (F, H, W, 3), light directions (F, 3), intensities (F, 3) and mask (H, W), as a
     notebook reads them.
     """
-    images = [
-        cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., ::-1]
-        for path in sorted(folder.glob("[01]*.png"))
-    ]
+    images = [read_image(path)[..., ::-1] for path in sorted(folder.glob("[01]*.png"))]
     directions, intensities = (
         np.loadtxt(folder / f"light_{name}.txt") for name in ("directions", "intensities")
     )
@@ -49,7 +46,7 @@ def matte(dtype: type = np.float64, scale: float = 1.0) -> tuple[NDArray[Any], N
 
 
 @pytest.mark.parametrize("intensities_known", [True, False])
-def test_the_same_to_the_last_bit_as_infer(intensities_known: bool, tmp_path: Path) -> None:
+def test_the_same_to_the_last_bit_as_infer(intensities_known, tmp_path):
     """With unknown intensities, both estimate them from the images."""
     images, directions, intensities, mask = read_medallion()
     folder = tmp_path / "medallion"
@@ -72,12 +69,12 @@ def test_the_same_to_the_last_bit_as_infer(intensities_known: bool, tmp_path: Pa
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_the_same_warnings_as_infer(tmp_path: Path) -> None:
+def test_the_same_warnings_as_infer(tmp_path):
     """Three lights of a small part: the network was not trained with so few."""
     images, directions, intensities, mask = read_medallion()
     small = np.zeros_like(mask)
     small[80:110, 80:110] = mask[80:110, 80:110]
-    assert cv2.imwrite(str(tmp_path / "mask.png"), small * np.uint8(255))
+    write_image(tmp_path / "mask.png", small * np.uint8(255))
     options = [
         "--light-indices",
         "0,3,6",
@@ -97,7 +94,7 @@ def test_the_same_warnings_as_infer(tmp_path: Path) -> None:
         progress=done.append,
     )
     assert sum(done) == small.sum() > 0
-    told = json.loads((tmp_path / "medallion/report.json").read_text())["warnings"]
+    told = read_json(tmp_path / "medallion/report.json")["warnings"]
     assert [warning.code for warning in estimate.capture.warnings] == [
         warning["code"] for warning in told
     ]
@@ -108,7 +105,7 @@ def test_the_same_warnings_as_infer(tmp_path: Path) -> None:
     ("dtype", "scale"),
     [(np.float32, 3.0), (np.float64, 1e-3), (np.uint16, 50_000), (np.uint8, 200)],
 )
-def test_matte_images_of_each_type(dtype: type, scale: float) -> None:
+def test_matte_images_of_each_type(dtype, scale):
     images, normals = matte(dtype, scale)
     estimate = splinecli.estimate_normals(
         images, 5 * LIGHTS, method="ls", light_intensities=np.ones(len(LIGHTS))
@@ -121,14 +118,14 @@ def test_matte_images_of_each_type(dtype: type, scale: float) -> None:
 
 # clipped ones, as stored
 @pytest.mark.filterwarnings("ignore:The images fit the lights much better if")
-def test_saturated_values_are_restored_unless_as_stored() -> None:
+def test_saturated_values_are_restored_unless_as_stored():
     lights = np.concatenate((LIGHTS, LIGHTS[1:] * (-1, -1, 1)))
     _, normals = matte()
     images = np.moveaxis(normals @ lights.T, -1, 0)
     clipped = np.minimum(65_535 * images / 0.85, 65_535).astype(np.uint16)
     assert 0.1 < (clipped == 65_535).mean() < 0.5
 
-    def worst(images: NDArray[Any], **options: Any) -> float:
+    def worst(images, **options):
         known = np.ones(len(lights))
         estimate = splinecli.estimate_normals(
             images, lights, light_intensities=known, method="ls", **options
@@ -174,7 +171,7 @@ def test_saturated_values_are_restored_unless_as_stored() -> None:
         ({"light_intensities": np.zeros(4)}, InputError, "not a finite number above 0"),
     ],
 )
-def test_wrong_arguments(change: dict[str, Any], error: type[Exception], message: str) -> None:
+def test_wrong_arguments(change, error, message):
     arguments: dict[str, Any] = {
         "images": np.ones((4, 5, 6)),
         "light_directions": LIGHTS,
@@ -185,13 +182,13 @@ def test_wrong_arguments(change: dict[str, Any], error: type[Exception], message
     assert message in str(caught.value)
 
 
-def test_importing_the_package_loads_neither_torch_nor_numpy() -> None:
+def test_importing_the_package_loads_neither_torch_nor_numpy():
     code = "import sys, splinecli; print({'numpy', 'torch', 'cv2'}.intersection(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert done.stdout == "set()\n"
 
 
-def test_the_capture_has_a_mask_of_its_own() -> None:
+def test_the_capture_has_a_mask_of_its_own():
     images, normals = matte()
     mask = np.ones(normals.shape[:2], np.bool_)
     estimate = splinecli.estimate_normals(images, LIGHTS, mask, method="ls")

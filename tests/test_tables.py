@@ -40,14 +40,14 @@ def capture() -> Capture:
 
 
 @pytest.mark.parametrize("name", make_tables.PAGES)
-def test_tables_of_the_documentation(name: str) -> None:
-    """`python docs/make_tables.py` writes them."""
+def test_tables_of_the_documentation(name):
+    """`python docs/generate.py` writes them."""
     text = (make_tables.DOCS / name).read_text("utf-8")
     assert text == make_tables.fill(text)
     assert "<!-- table: " in text
 
 
-def test_no_method_is_known_by_its_name_or_has_hidden_hooks() -> None:
+def test_no_method_is_known_by_its_name_or_has_hidden_hooks():
     names = "|".join(METHODS)
     by_name = re.compile(
         rf"""(?<!grid) [!=]= "(?:{names})"|startswith\("(?:spline|cnn)|(?:get|has)attr\(estimator"""
@@ -62,14 +62,14 @@ class Flat(Estimator):
 
     name = fingerprint = "flat"
 
-    def estimate(self, observations, light_directions, *, progress=None):  # type: ignore[no-untyped-def]
+    def estimate(self, observations, light_directions, *, progress=None):
         return np.tile((0.0, 0.0, 1.0), (len(observations), 1))
 
     def warn_of_lights(self, n_lights: int) -> list[str]:
         return [f"{n_lights} lights are not needed."]
 
 
-def test_a_method_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_method_is_a_row(monkeypatch):
     monkeypatch.setitem(
         METHODS, "flat", Method(lambda name, options: Flat(), "a constant", "nobody")
     )
@@ -80,7 +80,7 @@ def test_a_method_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     assert estimate.confidence_map is None
 
 
-def test_a_warning_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_warning_is_a_row(monkeypatch):
     uniform = WarningKind(
         "uniform", "All values are equal", "Photograph an object", severity="error"
     )
@@ -90,7 +90,7 @@ def test_a_warning_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
         in make_tables.warnings_table()
     )
 
-    def check(seen: checks.Evidence) -> list[CaptureWarning]:
+    def check(seen):
         return (
             [CaptureWarning(uniform, "All values are equal.")]
             if np.ptp(seen.observations) == 0
@@ -104,7 +104,7 @@ def test_a_warning_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
         checks.refuse_if_strict(warnings[-1:], "flat", strict=True)
 
 
-def test_a_map_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_is_a_row(monkeypatch):
     row = OutputMap(
         name="slant",
         content="cosine between normal and camera axis",
@@ -120,7 +120,7 @@ def test_a_map_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     mask, estimate = np.ones((2, 3), np.bool_), estimate_normals(capture(), make_estimator("ls"))
     assert chosen_maps(["slant", "preview"])[-1] is row
     assert row in chosen_maps([], page=True)
-    values = make_map(row, None, estimate)  # type: ignore[arg-type]
+    values = make_map(row, None, estimate)
     assert dict(map_files(row, values, mask, ["npy"])).keys() == {"slant.npy", "slant.png"}
     assert dict(map_files(row, values, mask, ["tiff"])).keys() == {
         "slant.npy",
@@ -130,14 +130,14 @@ def test_a_map_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     # so that it is no photograph
     assert {"slant.npy", "slant.tiff", "slant.png"} <= set(own_files())
     assert (
-        "| `slant` | `slant.npy`, `slant.tiff`, `slant.png` | cosine between normal and camera"
-        " axis |" in (make_tables.maps_table())
+        "| `slant` | `slant.npy`, `slant.tiff`, `slant.png` | cosine between normal and camera "
+        "axis |" in (make_tables.maps_table())
     )
     assert results_bytes(100, 4, maps=["slant"]) - results_bytes(100, 4) == 700
     page = result_page(REPORT, estimate.normal_map, mask, values={"slant": values})
     assert "<figcaption>Slant</figcaption>" in page
     given = (
-        typer.main.get_command(app)
+        typer.main.get_command(app)  # type: ignore[attr-defined]
         .commands["infer"]
         .make_context("infer", ["x", "--maps", "slant:0.5"])
         .params
@@ -150,7 +150,7 @@ def slant(source: object, estimate: NormalEstimate, progress: object) -> NDArray
 
 
 @pytest.mark.parametrize("row", MAPS.values(), ids=list(MAPS))
-def test_functions_of_the_maps_exist(row: OutputMap) -> None:
+def test_functions_of_the_maps_exist(row):
     assert {row.name, *(part.name for part in row.parts)} <= MAP_FUNCTIONS.keys()
     assert {Path(name).stem for name in row.files.values()} <= NOT_PHOTOGRAPHS or row.suffixes == (
         "npy",

@@ -17,6 +17,7 @@ import tifffile
 from PIL import Image
 
 import scenes
+from scenes import to_uint16, write_image
 from splinecli.capture import (
     CaptureOptions,
     CaptureSource,
@@ -38,7 +39,7 @@ from splinecli.recipe import RecipeOptions, prepare_capture
 SIZE = 32
 LIGHTS = scenes.spiral_lights(12, 40)
 NORMALS, DISC = scenes.sphere(SIZE, 0.6)
-PICTURES = np.rint(np.moveaxis(scenes.shade(NORMALS, LIGHTS), -1, 0) * 50_000).astype(np.uint16)
+PICTURES = to_uint16(np.moveaxis(scenes.shade(NORMALS, LIGHTS), -1, 0) * 50_000)
 MASK = DISC.astype(np.uint8) * 255
 
 Change = Callable[[Path], Path | None]
@@ -64,13 +65,13 @@ def check(source: CaptureSource, mask: np.ndarray | None = DISC) -> list[str]:
 
 def picture(path: Path, image: np.ndarray) -> None:
     path.parent.mkdir(exist_ok=True)
-    assert cv2.imwrite(str(path), image)
+    write_image(path, image)
 
 
 @pytest.mark.parametrize(
     "name", ["cat_mask.png", "cat.mask.tif", "mask_1.png", "../cat_mask.png", "../cat.mask.bmp"]
 )
-def test_masks_by_name(folder: Path, name: str) -> None:
+def test_masks_by_name(folder, name):
     picture(folder / name, MASK)
     source = open_capture(folder)
     assert check(source) == ["mask_choice"]
@@ -81,7 +82,7 @@ def test_masks_by_name(folder: Path, name: str) -> None:
     assert len(balls.images) == 12 and balls.mask == source.files.mask
 
 
-def test_two_masks_are_named_and_none_is_used(folder: Path) -> None:
+def test_two_masks_are_named_and_none_is_used(folder):
     picture(folder / "mask_left.png", MASK)
     picture(folder / "mask_right.png", MASK)
     picture(folder / "mask_small.png", MASK[::2, ::2])
@@ -96,7 +97,7 @@ def test_two_masks_are_named_and_none_is_used(folder: Path) -> None:
     ]
 
 
-def test_alpha_is_a_mask_if_there_is_no_other(folder: Path) -> None:
+def test_alpha_is_a_mask_if_there_is_no_other(folder):
     for number, image in enumerate(PICTURES):
         picture(
             folder / f"{number:03}.png", np.dstack([image] * 3 + [MASK.astype(np.uint16) * 257])
@@ -109,7 +110,7 @@ def test_alpha_is_a_mask_if_there_is_no_other(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("listed", [False, True])
-def test_images_in_a_folder_of_their_own(folder: Path, listed: bool) -> None:
+def test_images_in_a_folder_of_their_own(folder, listed):
     (folder / "images").mkdir()
     for path in folder.glob("*.png"):
         path.rename(folder / "images" / path.name)
@@ -121,7 +122,7 @@ def test_images_in_a_folder_of_their_own(folder: Path, listed: bool) -> None:
     assert source.files.name == "cat" and len(source.files.images) == 12
 
 
-def test_bmp_ground_truth(folder: Path) -> None:
+def test_bmp_ground_truth(folder):
     picture(folder / "normals_gt.bmp", np.rint((NORMALS[..., ::-1] + 1) * 127.5).astype(np.uint8))
     truth = prepare_capture(open_capture(folder, CaptureOptions(mask=None))).ground_truth
     assert truth is not None and angle_between_deg(truth[DISC], NORMALS[DISC]).max() < 1
@@ -196,7 +197,7 @@ FOUND = {
 
 
 @pytest.mark.parametrize("case", FOUND)
-def test_light_files(folder: Path, case: str) -> None:
+def test_light_files(folder, case):
     (folder / "light_directions.txt").unlink()
     name, text = FOUND[case]
     (folder / name).write_text(text)
@@ -264,7 +265,7 @@ REFUSED = {
     ("name", "text", "message"),
     [(name, *case) for name, cases in REFUSED.items() for case in cases],
 )
-def test_refused_light_files(folder: Path, name: str, text: str, message: str) -> None:
+def test_refused_light_files(folder, name, text, message):
     (folder / "light_directions.txt").unlink()
     (folder / name).write_text(text)
     with pytest.raises(InputError) as refused:
@@ -272,7 +273,7 @@ def test_refused_light_files(folder: Path, name: str, text: str, message: str) -
     assert str(refused.value).startswith(f"{folder / name}:") and message in str(refused.value)
 
 
-def test_intensities_of_the_json_count_unless_a_file_is_given(folder: Path, tmp_path: Path) -> None:
+def test_intensities_of_the_json_count_unless_a_file_is_given(folder, tmp_path):
     (folder / "light_directions.txt").unlink()
     (folder / "lights.json").write_text(alice(NUMBERS, intensity=[2.0, 1.0, 0.5]))
     assert open_capture(folder).light_intensities.tolist() == [[2.0, 1.0, 0.5]] * 12
@@ -285,7 +286,7 @@ def test_intensities_of_the_json_count_unless_a_file_is_given(folder: Path, tmp_
     )
 
 
-def test_umlauts_of_older_programs_and_images_that_are_not_named(folder: Path) -> None:
+def test_umlauts_of_older_programs_and_images_that_are_not_named(folder):
     (folder / "light_directions.txt").unlink()
     for path in folder.glob("*.png"):
         path.rename(folder / f"schräg {path.name}")
@@ -312,7 +313,7 @@ def test_umlauts_of_older_programs_and_images_that_are_not_named(folder: Path) -
         ("lamps.csv", angles("azel"), r"Add --lights .*lamps\.csv --light-format azel"),
     ],
 )
-def test_light_files_that_are_named(folder: Path, name: str, text: str, hint: str) -> None:
+def test_light_files_that_are_named(folder, name, text, hint):
     """The option of the message reads the file."""
     (folder / "light_directions.txt").unlink()
     (folder / name).write_text(text)
@@ -323,7 +324,7 @@ def test_light_files_that_are_named(folder: Path, name: str, text: str, hint: st
     assert check(open_capture(folder, CaptureOptions(lights=lights, **options)), None) == []
 
 
-def test_a_dome_has_positions(folder: Path) -> None:
+def test_a_dome_has_positions(folder):
     lamps = LIGHTS * 300 + (0, 0, 20)
     positions = [dict(zip("xyz", row, strict=True)) for row in rows(lamps)]
     dome = {
@@ -340,7 +341,7 @@ def test_a_dome_has_positions(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("vector", ["0.1 0.2 -0.1", "0 0 0"])
-def test_one_bad_light_is_left_out(folder: Path, vector: str) -> None:
+def test_one_bad_light_is_left_out(folder, vector):
     lines = LINES.splitlines()
     lines[4] = vector
     (folder / "light_directions.txt").write_text("\n".join(lines))
@@ -355,7 +356,7 @@ def test_one_bad_light_is_left_out(folder: Path, vector: str) -> None:
         open_capture(folder)
 
 
-def test_copies_are_one_photograph(folder: Path) -> None:
+def test_copies_are_one_photograph(folder):
     for number, image in enumerate(PICTURES):
         picture(folder / f"{number:03}.jpg", (image >> 8).astype(np.uint8))
     source = open_capture(folder)
@@ -365,7 +366,7 @@ def test_copies_are_one_photograph(folder: Path) -> None:
     )
 
 
-def test_pictures_of_results_are_left_out_where_the_count_says_so(folder: Path) -> None:
+def test_pictures_of_results_are_left_out_where_the_count_says_so(folder):
     for name in ("demo.png", "result_1.png", "result_2.png"):
         picture(folder / name, PICTURES[0])
     source = open_capture(folder)
@@ -409,7 +410,7 @@ WRITERS = {
 
 
 @pytest.mark.parametrize("form", WRITERS)
-def test_images_of_other_formats(folder: Path, form: str) -> None:
+def test_images_of_other_formats(folder, form):
     for path in folder.glob("*.png"):
         path.unlink()
     WRITERS[form](folder)
@@ -425,7 +426,7 @@ def test_images_of_other_formats(folder: Path, form: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".webp", ".avif", ".heic"])
-def test_display_encoded_formats(folder: Path, suffix: str) -> None:
+def test_display_encoded_formats(folder, suffix):
     """An 8-bit photograph with the sRGB curve, stored with little or no loss."""
     if suffix == ".heic":
         pytest.importorskip("pillow_heif").register_heif_opener()
@@ -444,9 +445,7 @@ def test_display_encoded_formats(folder: Path, suffix: str) -> None:
     assert angle_between_deg(normals[DISC], NORMALS[DISC]).mean() < 0.5
 
 
-def test_formats_that_need_an_extra_or_are_not_read(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_formats_that_need_an_extra_or_are_not_read(folder, monkeypatch):
     for path in folder.glob("*.png"):
         path.rename(path.with_suffix(".heic"))
         path.with_suffix(".heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0" + bytes(64))

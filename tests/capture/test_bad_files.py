@@ -4,13 +4,12 @@ import builtins
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import tifffile
 
+from scenes import to_uint16, write_image
 from splinecli.capture import open_capture
 from splinecli.errors import InputError
 from splinecli.recipe import prepare_capture, read_capture
@@ -38,7 +37,7 @@ def no_warnings(capfd: pytest.CaptureFixture[str]) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("no_warnings")
-def test_a_truncated_tiff(folder: Path) -> None:
+def test_a_truncated_tiff(folder):
     data = (folder / "2.tif").read_bytes()
     for size in (0, 8, 9, 60, 100, 200, 1000, -10):
         (folder / "2.tif").write_bytes(data[:size])
@@ -51,12 +50,12 @@ def test_a_truncated_tiff(folder: Path) -> None:
 @pytest.mark.usefixtures("no_warnings")
 @pytest.mark.parametrize("light", [(0, 0, 1), (0.6, 0, 0.8)])
 @pytest.mark.parametrize("as_stored", [True, False])
-def test_identical_lights(tmp_path: Path, light: tuple[float, ...], as_stored: bool) -> None:
+def test_identical_lights(tmp_path, light, as_stored):
     """On a scene whose intensities would be estimated, were the lights not identical."""
     rng = np.random.default_rng(0)
     for number in range(8):
         shading = np.linspace(0.1, 1, 900).reshape(30, 30) * rng.uniform(0.5, 1.5)
-        cv2.imwrite(str(tmp_path / f"{number}.png"), np.rint(shading * 40_000).astype(np.uint16))
+        write_image(tmp_path / f"{number}.png", to_uint16(shading * 40_000))
     np.savetxt(tmp_path / "lights.txt", [light] * 8)
     with pytest.raises(InputError, match="the 8 lights are in one plane"):
         read_capture(tmp_path, as_stored=as_stored)
@@ -66,17 +65,15 @@ def test_identical_lights(tmp_path: Path, light: tuple[float, ...], as_stored: b
     "name",
     ["1.tif", "lights.txt", "light_intensities.txt", "mask.png", "normals_gt.npy", "ambient.png"],
 )
-def test_a_file_that_may_not_be_read(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_a_file_that_may_not_be_read(folder, monkeypatch, name):
     """Even root may not."""
-    cv2.imwrite(str(folder / "mask.png"), np.full((20, 25), 255, np.uint8))
-    cv2.imwrite(str(folder / "ambient.png"), np.full((20, 25), 255, np.uint8))
+    write_image(folder / "mask.png", np.full((20, 25), 255, np.uint8))
+    write_image(folder / "ambient.png", np.full((20, 25), 255, np.uint8))
     np.save(folder / "normals_gt.npy", np.broadcast_to([0.0, 0.0, 1.0], (20, 25, 3)))
     np.savetxt(folder / "light_intensities.txt", np.ones((4, 3)))
     for owner, original in ((Path, Path.open), (builtins, builtins.open)):
 
-        def refuse(file: Any, *args: Any, original: Any = original, **kwargs: Any) -> Any:
+        def refuse(file, *args, original=original, **kwargs):
             if isinstance(file, str | Path) and Path(file) == folder / name:
                 raise PermissionError(13, "Permission denied", str(file))
             return original(file, *args, **kwargs)
@@ -87,7 +84,7 @@ def test_a_file_that_may_not_be_read(
     assert str(caught.value) == f"{folder / name}: the file cannot be read (Permission denied)."
 
 
-def test_an_image_that_vanishes(folder: Path) -> None:
+def test_an_image_that_vanishes(folder):
     source = open_capture(folder)
     (folder / "3.tif").unlink()
     with pytest.raises(InputError, match=r"3\.tif: the file (does not exist|cannot be read)"):

@@ -1,6 +1,5 @@
 """Three coloured lamps at once: gray spheres whose crosstalk and normals are known."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scenes import ring_lights, shade, sphere, write_capture
+from scenes import Floats, read_json, ring_lights, shade, sphere, to_uint16, write_capture
 from splinecli.capture.channel_lights import channel_lights
 from splinecli.errors import InputError, UsageError
 from splinecli.lights.calibration.balls import find_ball_files
@@ -19,7 +18,6 @@ from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions, InfoOptions, ReadingOptions
 from splinecli.pipeline.info import describe_capture, summary_lines
 
-Floats = NDArray[np.float64]
 NORMALS, MASK = sphere(90)
 LIGHTS = np.concatenate((ring_lights(3, 35), ring_lights(3, 50, 0.8)))
 CROSSTALK = np.array([[1.0, 0.2, 0.05], [0.15, 1.3, 0.2], [0.02, 0.25, 0.7]])
@@ -33,7 +31,7 @@ def photograph(
     """
     shading = shade(NORMALS, lights).reshape(*MASK.shape, -1, 3) * MASK[..., None, None]
     images = np.moveaxis(shading, 2, 0) @ crosstalk.T * paint
-    return np.rint(images * 30_000).astype(np.uint16)
+    return to_uint16(images * 30_000)
 
 
 def write(folder: Path, count: int, paint: Floats | float = 1.0) -> Path:
@@ -62,16 +60,16 @@ def errors_deg(folder: Path, out: Path, lights: Floats, **options: Any) -> Float
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_a_colour_image_gives_the_normals_of_a_gray_sphere(count: int, tmp_path: Path) -> None:
+def test_a_colour_image_gives_the_normals_of_a_gray_sphere(count, tmp_path):
     folder = write(tmp_path / "gray", count)
     assert errors_deg(folder, tmp_path / "out", LIGHTS[: 3 * count]).max() < 0.2
-    report = json.loads((tmp_path / "out/gray/report.json").read_text())
+    report = read_json(tmp_path / "out/gray/report.json")
     assert report["n_lights"] == 3 * count and "lights_in_channels" in [
         each["code"] for each in report["warnings"]
     ]
 
 
-def test_messages_count_the_lights_of_channels(tmp_path: Path) -> None:
+def test_messages_count_the_lights_of_channels(tmp_path):
     folder = write(tmp_path / "gray", 1)
     reading = ReadingOptions(lights_in_channels=True)
     report = describe_capture(InfoOptions(capture=folder), reading)
@@ -86,24 +84,24 @@ def test_messages_count_the_lights_of_channels(tmp_path: Path) -> None:
         reading.open(folder)
 
 
-def test_the_networks_take_two_images(tmp_path: Path) -> None:
+def test_the_networks_take_two_images(tmp_path):
     folder = write(tmp_path / "gray", 2)
     assert errors_deg(folder, tmp_path / "out", LIGHTS, method="spline-net").mean() < 4
 
 
-def test_paint_is_taken_for_shading(tmp_path: Path) -> None:
+def test_paint_is_taken_for_shading(tmp_path):
     folder = write(tmp_path / "red", 1, paint=np.array((1.0, 0.4, 0.4)))
     assert errors_deg(folder, tmp_path / "out", LIGHTS[:3]).mean() > 5
 
 
-def test_the_intensities_of_the_lamps_are_divided_out(tmp_path: Path) -> None:
+def test_the_intensities_of_the_lamps_are_divided_out(tmp_path):
     folder, uneven = tmp_path / "gray", np.diag((1.0, 1.5, 0.6))
     write_capture(folder, photograph(LIGHTS, uneven), LIGHTS, mask=MASK)
     np.savetxt(folder / "light_intensities.txt", np.tile(np.diag(uneven), (2, 1)))
     assert errors_deg(folder, tmp_path / "out", LIGHTS).max() < 0.2
 
 
-def test_crosstalk_is_measured_on_a_gray_ball(tmp_path: Path) -> None:
+def test_crosstalk_is_measured_on_a_gray_ball(tmp_path):
     write_capture(tmp_path / "ball", photograph(LIGHTS), None, mask=MASK)
     found = measure_crosstalk(find_ball_files(tmp_path / "ball"), LIGHTS)
     expected = CROSSTALK / np.trace(CROSSTALK) * 3
@@ -112,7 +110,7 @@ def test_crosstalk_is_measured_on_a_gray_ball(tmp_path: Path) -> None:
         measure_crosstalk(find_ball_files(tmp_path / "ball"), LIGHTS[:3])
 
 
-def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+def test_what_does_not_fit_is_refused(tmp_path):
     write(tmp_path / "gray", 1)
     (tmp_path / "matrix.txt").write_text("1 1 1\n1 1 1\n1 1 1.1\n")
     with pytest.raises(InputError, match="do not separate the lamps"):

@@ -5,11 +5,12 @@ value for value.
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import tifffile
+from numpy.testing import assert_allclose, assert_array_equal
 
+from scenes import to_uint16, write_image
 from splinecli.capture import capture_name, find_captures, open_capture
 from splinecli.errors import InputError
 from splinecli.recipe import read_capture
@@ -44,10 +45,10 @@ def write_object(
     """An object as published; returns the images (F, H, W, 3) of each kind."""
     folder.mkdir(parents=True)
     np.savetxt(folder / "light.txt", LIGHTS[:n_lights], fmt="%.6f")
-    encoded = np.rint((normals() + 1) / 2 * 65535).astype(np.uint16)
+    encoded = to_uint16((normals() + 1) / 2 * 65535)
     tifffile.imwrite(folder / "gt_normal.tif", encoded, photometric="rgb")
     for name, boundary in zip(("inboundary.png", "onboundary.png"), boundaries(), strict=True):
-        cv2.imwrite(str(folder / name), boundary)
+        write_image(folder / name, boundary)
     rng = np.random.default_rng(seed)
     written = {}
     for kind in kinds:
@@ -74,40 +75,38 @@ def message(call: Callable[[], object]) -> str:
     return str(caught.value)
 
 
-def test_every_value_is_what_was_written(tmp_path: Path) -> None:
+def test_every_value_is_what_was_written(tmp_path):
     written = write_object(tmp_path / "Bunny", "specular", "metallic")["metallic"]
     capture = read_capture(tmp_path / "Bunny/images_metallic")
     assert capture.name == "Bunny_metallic"
     inner, rim = boundaries()
     mask = (inner > 0) | (rim > 0)
     assert capture.n_pixels == 35
-    np.testing.assert_array_equal(capture.mask, mask)
+    assert_array_equal(capture.mask, mask)
     expected = written.astype(np.float64).mean(axis=-1)[:, mask].T / 65535
     # float32 keeps 24 bits, and three channels are added.
-    np.testing.assert_allclose(capture.observations, expected, rtol=3e-7, atol=0)
+    assert_allclose(capture.observations, expected, rtol=3e-7, atol=0)
     unit = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)
-    np.testing.assert_allclose(capture.light_directions, unit, rtol=1e-12)
+    assert_allclose(capture.light_directions, unit, rtol=1e-12)
     # Rounded to 16 bits: half a step of 2 / 65535 on each axis.
-    np.testing.assert_allclose(capture.ground_truth[mask], normals()[mask], atol=2.5e-5)
+    assert_allclose(capture.ground_truth[mask], normals()[mask], atol=2.5e-5)
     assert not capture.ground_truth[~mask].any()
 
 
-def test_an_object_with_one_kind_is_that_capture(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_object_with_one_kind_is_that_capture(tmp_path, monkeypatch):
     write_object(tmp_path / "Bunny", "diffuse")
     by_object, by_folder = (
         read_capture(tmp_path / "Bunny"),
         read_capture(tmp_path / "Bunny/images_diffuse"),
     )
     assert by_object.name == by_folder.name == "Bunny_diffuse"
-    np.testing.assert_array_equal(by_object.observations, by_folder.observations)
+    assert_array_equal(by_object.observations, by_folder.observations)
     monkeypatch.chdir(tmp_path / "Bunny/images_diffuse")
     for way in (".", "..", "../images_diffuse", "../../Bunny", str(tmp_path / "Bunny/")):
         assert capture_name(way) == open_capture(way).files.name == "Bunny_diffuse"
 
 
-def test_find_captures(tree: Path) -> None:
+def test_find_captures(tree):
     objects = [tree / "PRPS/Bunny9", tree / "PRPS/Bunny10"]
     of_prps = [folder / f"images_{kind}" for folder in objects for kind in ("metallic", "specular")]
     of_diffuse = [tree / f"PRPS_Diffuse/{name}/images_diffuse" for name in ("Bunny9", "Bunny10")]
@@ -130,7 +129,7 @@ def test_find_captures(tree: Path) -> None:
     ]
 
 
-def test_missing_files_of_the_object(tmp_path: Path) -> None:
+def test_missing_files_of_the_object(tmp_path):
     folder = tmp_path / "Bunny"
     write_object(folder, "specular")
     (folder / "gt_normal.tif").unlink()
@@ -149,23 +148,23 @@ def test_missing_files_of_the_object(tmp_path: Path) -> None:
         and "Pass --mask FILE" in found
     )
     mask = tmp_path / "mask.png"
-    cv2.imwrite(str(mask), boundaries()[1])
+    write_image(mask, boundaries()[1])
     # above half of the largest, as in other layouts
     assert read_capture(folder, mask=mask).n_pixels == 7
 
 
-def test_masks_that_do_not_fit(tmp_path: Path) -> None:
+def test_masks_that_do_not_fit(tmp_path):
     folder = tmp_path / "Bunny"
     write_object(folder, "specular")
-    cv2.imwrite(str(folder / "onboundary.png"), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    write_image(folder / "onboundary.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     assert read_capture(folder).n_pixels == 21
-    cv2.imwrite(str(folder / "inboundary.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    write_image(folder / "inboundary.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     found = message(lambda: read_capture(folder))
     assert (
         found
         == f"{folder}: the mask is empty: every pixel of inboundary.png and onboundary.png is zero."
     )
-    cv2.imwrite(str(folder / "onboundary.png"), np.ones((WIDTH, HEIGHT), np.uint8))
+    write_image(folder / "onboundary.png", np.ones((WIDTH, HEIGHT), np.uint8))
     found = message(lambda: read_capture(folder))
     assert found.endswith(
         "onboundary.png: found a mask of 7 x 11 pixels, expected 11 x 7 as in 00000.tif."

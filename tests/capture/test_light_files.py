@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from scipy.io import savemat
 
+from scenes import write_image
 from splinecli.capture import read_light_directions, read_light_intensities
 from splinecli.capture.light_files import light_encoder, match_images, read_lights
 from splinecli.errors import InputError
@@ -51,16 +53,16 @@ FORMS = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_directions(tmp_path: Path, form: str) -> None:
+def test_directions(tmp_path, form):
     for encoding in ("utf-8", "utf-8-sig", "utf-16"):
         directions = read_light_directions(write(tmp_path, FORMS[form], encoding), 4)
         assert directions.dtype == np.float64
-        np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-15)
+        assert_allclose(directions, DIRECTIONS, atol=1e-15)
 
 
-def test_lengths_far_from_one_neither_overflow_nor_underflow(tmp_path: Path) -> None:
+def test_lengths_far_from_one_neither_overflow_nor_underflow(tmp_path):
     directions = read_light_directions(write(tmp_path, "0 3e300 4e300\n0 3e-300 4e-300\n0 0 1"))
-    np.testing.assert_allclose(directions[:2], [[0, 0.6, 0.8]] * 2)
+    assert_allclose(directions[:2], [[0, 0.6, 0.8]] * 2)
 
 
 @settings(deadline=None)
@@ -83,7 +85,7 @@ def test_directions_round_trip(vectors, separator, counted, transposed):
         path = write(Path(folder), "\n".join(([str(len(values))] if counted else []) + rows))
         directions = read_light_directions(path, len(values))
     expected = values / np.linalg.norm(values, axis=1, keepdims=True)
-    np.testing.assert_allclose(directions, expected, rtol=1e-12, atol=1e-15)
+    assert_allclose(directions, expected, rtol=1e-12, atol=1e-15)
 
 
 COMMA = "A comma separates columns; write decimals with a point."
@@ -119,7 +121,7 @@ COMMA = "A comma separates columns; write decimals with a point."
         ("# nothing\n", None, "the file contains no numbers"),
     ],
 )
-def test_wrong_directions(tmp_path: Path, text: str, line: int | None, message: str) -> None:
+def test_wrong_directions(tmp_path, text, line, message):
     path = write(tmp_path, text)
     with pytest.raises(InputError) as caught:
         read_light_directions(path, 5 if line is None else None)
@@ -129,8 +131,8 @@ def test_wrong_directions(tmp_path: Path, text: str, line: int | None, message: 
     assert (caught.value.path, caught.value.line) == (path, line)
 
 
-def test_files_that_are_no_text(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "mask.png"), np.zeros((3, 3), np.uint8))
+def test_files_that_are_no_text(tmp_path):
+    write_image(tmp_path / "mask.png", np.zeros((3, 3), np.uint8))
     write(tmp_path, "0 0 1 # \u00e9", encoding="latin-1")
     for name, message in (
         ("none.txt", r"none\.txt: the file does not exist\."),
@@ -155,7 +157,7 @@ GRAY = ("3\n1\n2\n5", "4\n3\n1\n2\n5", "3 1 2 5")
 
 
 @pytest.mark.parametrize("text", COLOURED + GRAY)
-def test_intensities(tmp_path: Path, text: str) -> None:
+def test_intensities(tmp_path, text):
     """In rows, after a count, or in columns; gray ones count for every channel."""
     expected = (
         [[3] * 3, [1] * 3, [2] * 3, [5] * 3]
@@ -182,7 +184,7 @@ def test_intensities(tmp_path: Path, text: str) -> None:
         ),
     ],
 )
-def test_wrong_intensities(tmp_path: Path, text: str, message: str) -> None:
+def test_wrong_intensities(tmp_path, text, message):
     path = write(tmp_path, text)
     with pytest.raises(InputError) as caught:
         read_light_intensities(path, 4)
@@ -190,12 +192,12 @@ def test_wrong_intensities(tmp_path: Path, text: str, message: str) -> None:
 
 
 @pytest.mark.parametrize("n_images", [None, 4])
-def test_one_light_in_each_column_is_no_count(tmp_path: Path, n_images: int | None) -> None:
+def test_one_light_in_each_column_is_no_count(tmp_path, n_images):
     # The first column, 1 3 2, would count three lights.
     path = write(tmp_path, "1 0 0 1\n3 1 0 0\n2 1 1 1")
     expected = np.array([[1, 3, 2], [0, 1, 1], [0, 0, 1], [1, 0, 1]])
     expected = expected / np.linalg.norm(expected, axis=1, keepdims=True)
-    np.testing.assert_allclose(read_light_directions(path, n_images), expected)
+    assert_allclose(read_light_directions(path, n_images), expected)
 
 
 @pytest.mark.parametrize(
@@ -211,14 +213,14 @@ def test_one_light_in_each_column_is_no_count(tmp_path: Path, n_images: int | No
     ids=["csv", "paths", "header", "stems"],
 )
 @pytest.mark.parametrize("stem", ["img", "2024_0"])
-def test_rows_that_name_their_image(tmp_path: Path, text: str, stem: str) -> None:
+def test_rows_that_name_their_image(tmp_path, text, stem):
     """A name such as 2024_01, which Python would read as a number, is a name."""
     table, directions = read_lights(write(tmp_path, text.replace("img", stem)), 4)
     wanted = [Path(f"{stem}{number}.png") for number in (1, 2, 3, 10)]
     images, how = match_images(table, wanted)
     assert how.startswith("name")
     found = dict(zip(images, directions, strict=True))
-    np.testing.assert_allclose([found[image] for image in wanted], DIRECTIONS, atol=1e-15)
+    assert_allclose([found[image] for image in wanted], DIRECTIONS, atol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -229,9 +231,7 @@ def test_rows_that_name_their_image(tmp_path: Path, text: str, stem: str) -> Non
         ([1, 2, 4, 1e-320], "not from 1e-12 to 1e"),
     ],
 )
-def test_factors_of_a_dome_are_inverse_intensities(
-    tmp_path: Path, factors: list[float], message: str | None
-) -> None:
+def test_factors_of_a_dome_are_inverse_intensities(tmp_path, factors, message):
     path = tmp_path / "a.dome"
     lights = [dict(zip("xyz", row, strict=True)) for row in DIRECTIONS.tolist()]
     path.write_text(
@@ -243,31 +243,29 @@ def test_factors_of_a_dome_are_inverse_intensities(
         )
     )
     if message is None:
-        np.testing.assert_allclose(
-            read_lights(path, 4)[0].intensities, 1 / np.tile(factors, (3, 1)).T
-        )
+        assert_allclose(read_lights(path, 4)[0].intensities, 1 / np.tile(factors, (3, 1)).T)
     else:
         with pytest.raises(InputError, match=message):
             read_lights(path, 4)
 
 
 @pytest.mark.parametrize("suffix", [".txt", ".npy", ".lp", ".csv"])
-def test_written_lights_are_read_again(tmp_path: Path, suffix: str) -> None:
+def test_written_lights_are_read_again(tmp_path, suffix):
     path = tmp_path / f"lights{suffix}"
     path.write_bytes(
         light_encoder(path)(DIRECTIONS, [Path(f"{number}.png") for number in range(4)])
     )
-    np.testing.assert_allclose(read_lights(path, 4)[1], DIRECTIONS, atol=1e-8)
+    assert_allclose(read_lights(path, 4)[1], DIRECTIONS, atol=1e-8)
     if suffix == ".csv":
         assert path.read_text().splitlines()[0] == "x,y,z"
 
 
 @pytest.mark.parametrize("text", ["0 90\n0 53.130102\n-90 53.130102\n143.130102 53.130102", None])
-def test_angles(tmp_path: Path, text: str | None) -> None:
+def test_angles(tmp_path, text):
     # atan2(0.36, -0.48) = 143.13 degrees, asin(0.8) = 53.13 degrees.
     counted = "2 0 53.130102\n1 0 90\n3 270 53.130102\n4 143.130102 53.130102"
     directions = read_light_directions(write(tmp_path, text or counted), 4, form="azel")
-    np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-7)
+    assert_allclose(directions, DIRECTIONS, atol=1e-7)
 
 
 ADD_AZEL = ".*add --light-format azel"
@@ -331,7 +329,7 @@ def write_opencv(path: Path, **matrices: np.ndarray) -> Path:
 
 @pytest.mark.parametrize("suffix", [".npy", ".yml", ".yaml", ".xml", ".mat", "packed.mat"])
 @pytest.mark.parametrize("transposed", [False, True])
-def test_arrays(tmp_path: Path, suffix: str, transposed: bool) -> None:
+def test_arrays(tmp_path, suffix, transposed):
     """Written by NumPy, OpenCV and SciPy themselves."""
     stored, path = (
         5 * (DIRECTIONS.T if transposed else DIRECTIONS).astype(np.float32),
@@ -344,10 +342,10 @@ def test_arrays(tmp_path: Path, suffix: str, transposed: bool) -> None:
         savemat(path, {"Dir": stored, **others}, do_compression=suffix != ".mat")
     else:
         write_opencv(path, camera=np.eye(3), lights=stored)
-    np.testing.assert_allclose(read_light_directions(path, 4), DIRECTIONS, atol=1e-7)
+    assert_allclose(read_light_directions(path, 4), DIRECTIONS, atol=1e-7)
 
 
-def test_refused_arrays(tmp_path: Path) -> None:
+def test_refused_arrays(tmp_path):
     for array, message in (
         (np.zeros((4, 3), "U1"), "expected finite numbers N x 3"),
         (np.full((4, 3), np.nan), "expected finite numbers N x 3"),
@@ -390,7 +388,7 @@ def test_refused_arrays(tmp_path: Path) -> None:
         ("a.mat", b"MATLAB 7.3 MAT-file" + bytes(300), "7.3 file, which is not supported"),
     ],
 )
-def test_damaged_matrices(tmp_path: Path, name: str, content: bytes, problem: str) -> None:
+def test_damaged_matrices(tmp_path, name, content, problem):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=problem):
         read_light_directions(tmp_path / name, 3)

@@ -31,12 +31,12 @@ def fill(folder: Path, names: str) -> Path:
     return folder
 
 
-def test_plain_folder_in_natural_order(tmp_path: Path) -> None:
+def test_plain_folder_in_natural_order(tmp_path):
     folder = fill(
         tmp_path / "vase",
-        "img10.png img2.PNG img1.png Img3.tif img04.jpeg notes.txt ._img1.png img5.exr sub/img6.png"
-        " lights.txt light_intensities.txt Mask.png normals_gt.npy normal_gt.png normals.png"
-        " error_map.png",
+        "img10.png img2.PNG img1.png Img3.tif img04.jpeg notes.txt ._img1.png img5.exr "
+        "sub/img6.png lights.txt light_intensities.txt Mask.png normals_gt.npy normal_gt.png "
+        "normals.png error_map.png",
     )
     files = find_capture_files(folder)
     assert [path.name for path in files.images] == [
@@ -53,7 +53,7 @@ def test_plain_folder_in_natural_order(tmp_path: Path) -> None:
     assert files.ground_truth == folder / "normals_gt.npy"
 
 
-def test_diligent_and_the_order_of_filenames_txt(tmp_path: Path) -> None:
+def test_diligent_and_the_order_of_filenames_txt(tmp_path):
     fill(
         tmp_path,
         "001.png 002.png 003.png light_directions.txt light_intensities.txt mask.png normal.txt",
@@ -67,7 +67,7 @@ def test_diligent_and_the_order_of_filenames_txt(tmp_path: Path) -> None:
     assert find_capture_files(tmp_path).ground_truth == tmp_path / "Normal_gt.mat"
 
 
-def test_overrides_go_first_and_are_no_photographs(tmp_path: Path) -> None:
+def test_overrides_go_first_and_are_no_photographs(tmp_path):
     folder = fill(
         tmp_path / "vase", "a.png b.png outline.png gt.tif lights.txt mask.png normal_gt.npy"
     )
@@ -80,7 +80,7 @@ def test_overrides_go_first_and_are_no_photographs(tmp_path: Path) -> None:
     assert found == tuple(given.values())
 
 
-def test_folders_that_are_no_capture(tmp_path: Path) -> None:
+def test_folders_that_are_no_capture(tmp_path):
     fill(tmp_path, "file empty/notes.txt dark/a.png dark/b.png")
     fill(tmp_path / "dataset", "b/a.png b/lights.txt a/a.png a/lights.txt")
     some = Overrides(lights=tmp_path / "file")
@@ -114,7 +114,7 @@ def test_folders_that_are_no_capture(tmp_path: Path) -> None:
     assert find_capture_files(tmp_path / "dark", some).light_directions == tmp_path / "file"
 
 
-def test_wrong_filenames_txt(tmp_path: Path) -> None:
+def test_wrong_filenames_txt(tmp_path):
     fill(tmp_path, "a.png lights.txt")
     for text, message in (
         (
@@ -130,14 +130,14 @@ def test_wrong_filenames_txt(tmp_path: Path) -> None:
             find_capture_files(tmp_path)
 
 
-def test_find_captures(tmp_path: Path) -> None:
+def test_find_captures(tmp_path):
     fill(tmp_path / "set", "o10/a.png o10/lights.txt o2/a.png o2/light_directions.txt o3/a.png")
     fill(tmp_path / "set", "o4/lights.txt o5/lights.txt o5/filenames.txt readme.txt lights.txt")
     assert [path.name for path in find_captures(tmp_path / "set")] == ["o2", "o5", "o10"]
     assert find_captures(tmp_path / "set/o2") == [tmp_path / "set/o2"]
 
 
-def test_find_captures_finds_none(tmp_path: Path) -> None:
+def test_find_captures_finds_none(tmp_path):
     fill(tmp_path, "set/o1/a.png set/o1/lights.txt empty/notes.txt")
     for name, message in (
         (
@@ -154,7 +154,7 @@ def test_find_captures_finds_none(tmp_path: Path) -> None:
             find_captures(tmp_path / name)
 
 
-def test_psbox(tmp_path: Path) -> None:
+def test_psbox(tmp_path):
     names = "Objects/b2.png Objects/b10.png LightProbe-1/ref.jpg light_directions.txt"
     folder = fill(tmp_path / "demo", names)
     files = find_capture_files(folder)
@@ -163,7 +163,7 @@ def test_psbox(tmp_path: Path) -> None:
     assert (files.mask, files.ground_truth) == (None, None)
 
 
-def test_paths_that_the_system_refuses(tmp_path: Path) -> None:
+def test_paths_that_the_system_refuses(tmp_path):
     folder = fill(tmp_path / "vase", "a.png lights.txt")
     loop = tmp_path / "loop"
     loop.symlink_to(loop)
@@ -219,7 +219,7 @@ def stamp(folder: Path) -> str:
 
 
 @pytest.mark.parametrize("name", ["1.png", "../flat.png"])
-def test_images_are_stamped_by_their_time(folder: Path, name: str) -> None:
+def test_images_are_stamped_by_their_time(folder, name):
     before = stamp(folder)
     assert stamp(folder) == before
     os.utime(folder / name, ns=(1, 1))
@@ -227,9 +227,7 @@ def test_images_are_stamped_by_their_time(folder: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_other_files_are_stamped_by_their_content(
-    folder: Path, name: str, write_image: WriteImage
-) -> None:
+def test_other_files_are_stamped_by_their_content(folder, name, write_image):
     before = stamp(folder)
     content = (folder / name).read_bytes()
     os.utime(folder / name, ns=(1, 1))
@@ -241,7 +239,7 @@ def test_other_files_are_stamped_by_their_content(
     assert stamp(folder) != before
 
 
-def test_pixel_sizes_are_stamped(folder: Path) -> None:
+def test_pixel_sizes_are_stamped(folder):
     (folder / "light_directions.txt").rename(folder / "light_positions.txt")
     stamps = set()
     for size in ("0.1", "0.2"):

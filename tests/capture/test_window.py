@@ -140,7 +140,7 @@ def test_a_part_is_lit_and_seen_as_in_the_whole(crop, scale, near, perspective, 
         lit = lighting_on(capture)(None, np.arange(capture.n_pixels)) if not near else None
         if near:
             places = [places.astype(np.float64) for places in np.nonzero(capture.mask)]
-            points = surface_points(
+            points = surface_points(  # type: ignore[call-arg]
                 capture.lamps, *places, np.full(capture.n_pixels, flat_depth(capture.lamps))
             )
             lit = PixelLighting.of(capture.observations, replace(capture.lamps, points=points))

@@ -16,6 +16,7 @@ import pytest
 import typer
 
 import scenes
+from scenes import read_json, to_uint16
 from splinecli.cli.main import main
 from splinecli.maths.normals import unit
 
@@ -52,7 +53,7 @@ def sphere_normals() -> np.ndarray:
 def write_capture(folder: Path) -> Path:
     """A capture with ground truth; its disc-shaped mask has 448 of 576 pixels."""
     normals, lights = sphere_normals(), unit(LIGHTS)
-    pictures = np.rint(np.moveaxis(normals @ lights.T, 2, 0) * 60_000).astype(np.uint16)
+    pictures = to_uint16(np.moveaxis(normals @ lights.T, 2, 0) * 60_000)
     disc = np.hypot(*scenes.square_grid(SIZE, 1 - 1 / SIZE)) < 1
     truth = normals.astype(np.float32)
     return scenes.write_capture(
@@ -85,7 +86,7 @@ def medallion() -> Path:
 
 
 def read_report(folder: Path) -> dict:
-    return json.loads((folder / "report.json").read_text("utf-8"))
+    return read_json(folder / "report.json")
 
 
 class Run(NamedTuple):

@@ -8,12 +8,12 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
 from cli.conftest import write_capture
+from scenes import write_image
 
 Spoil = Callable[[Path], list[object] | None]
 
@@ -35,7 +35,7 @@ def write(name: str, content: bytes | np.ndarray) -> Spoil:
         if isinstance(content, bytes):
             (capture / name).write_bytes(content)
         else:
-            cv2.imwrite(str(capture / name), content)
+            write_image(capture / name, content)
 
     return spoil
 
@@ -125,17 +125,16 @@ USAGE_ERRORS = {
     "infer X -z": "no option -z. See 'splinecli infer --help'.",
     "infer X --msk": "no option --msk. Did you mean --auto-mask, --maps or --mask? See 'splinecli"
     " infer --help'.",
-    "prepare -o"
-    " s --lights 20": "no option --lights. Did you mean --n-lights? See 'splinecli prepare"
-    " --help'.",
+    "prepare -o s --lights 20": "no option --lights. Did you mean --n-lights? See 'splinecli"
+    " prepare --help'.",
     "infer X --n-lights abc": "--n-lights is 'abc'; expected a whole number of at least 3.",
     "prepare -o s --n-lights 20.5": "--n-lights is '20.5'; expected a whole number of at least 16.",
     "prepare -o s --n-lights 4": "--n-lights is '4'; expected a whole number of at least 16.",
-    "evaluate X --light-noise-deg"
-    " 1 --light-noise-deg x": "--light-noise-deg is 'x'; expected a number of at least 0.",
+    "evaluate X --light-noise-deg 1 --light-noise-deg x": "--light-noise-deg is 'x'; expected a"
+    " number of at least 0.",
     "infer X --stiffness 2": "--stiffness is now --discontinuity. See 'splinecli infer --help'.",
-    "info X --lights-format"
-    " azel": "--lights-format is now --light-format. See 'splinecli info --help'.",
+    "info X --lights-format azel": "--lights-format is now --light-format. See 'splinecli"
+    " info --help'.",
     "info X --light-frame exchanged": "--light-frame is 'exchanged'; exchanged is now swap-xy.",
     "infer X --device tpu": "--device is 'tpu'; expected one of 'auto', 'cpu', 'cuda'.",
 }
@@ -144,33 +143,6 @@ USAGE_ERRORS = {
 def test_usage_errors(run):
     for arguments, message in USAGE_ERRORS.items():
         assert run(*arguments.split()) == (2, "", f"splinecli: {message}\n")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--workers", "0"), "--workers is '0'; expected a number of at least 1, or auto"),
-        (("--workers", "many"), "--workers is 'many'; expected a number of at least 1, or auto"),
-        (
-            ("--workers", "2", "--cluster", "tcp://a:1"),
-            "--workers and --cluster contradict each other",
-        ),
-        (("--shard", "3/2"), "--shard is 3/2; expected I/N with I from 1 to N"),
-        (("--shard", "half"), "--shard is 'half'; expected I/N"),
-        (
-            ("--cluster", "none.json"),
-            "--cluster is none.json; expected an address such as tcp://scheduler:8786",
-        ),
-    ],
-)
-def test_refused_options_of_clusters(arguments, message, capture, make_capture, run):
-    if "--cluster" in arguments:
-        pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    make_capture("second")
-    result = run("infer", capture, "second", "--method", "ls", *arguments)
-    assert (result.code, result.out, result.err.count("\n")) == (2, "", 1)
-    assert message in result.err
-    assert not Path("out").exists()
 
 
 @pytest.mark.parametrize("option", ["--crosstalk", "--mask", "--output"])

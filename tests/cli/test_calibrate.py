@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scenes import halfway, write_capture
+from scenes import halfway, read_image, read_json, to_uint16, write_capture, write_image
 from splinecli.capture import read_light_directions
 
 SIZE, CENTRE, RADIUS = (100, 120), (60.0, 48.0), 40.0
@@ -29,7 +29,7 @@ def write_balls(folder: Path, lights=LIGHTS, *, wall: float = 0.2) -> Path:
     for number, half in enumerate(halfway(lights)):
         spot = np.exp(-((np.degrees(np.arccos((n @ half).clip(-1, 1))) / 2) ** 2))
         picture = np.where(inside, 0.02 + 0.9 * spot, wall)
-        cv2.imwrite(str(folder / f"{number}.png"), np.rint(picture * 65535).astype(np.uint16))
+        write_image(folder / f"{number}.png", to_uint16(picture * 65535))
     return folder
 
 
@@ -41,9 +41,7 @@ def write_gray(folder: Path, intensities) -> Path:
         * (n @ LIGHTS.T).clip(0).transpose(2, 0, 1)
         * inside
     )
-    return write_capture(
-        folder, np.rint(images * 65535).astype(np.uint16), None, mask=inside, names="{}.png"
-    )
+    return write_capture(folder, to_uint16(images * 65535), None, mask=inside, names="{}.png")
 
 
 def angles_deg(found, expected=LIGHTS):
@@ -75,15 +73,15 @@ def test_an_outline_given_by_the_user(document):
     }
     assert angles_deg(np.array(report["light_directions"])).max() < 0.6
     assert report["disagreement_deg"] is None
-    assert json.loads(Path("out/calibration.json").read_text()) == report
+    assert read_json("out/calibration.json") == report
 
 
 def test_positions_need_the_camera(run):
     """Two balls side by side show distant lamps alike."""
     for name, pads in (("one", (0, 180)), ("two", (180, 0))):
         for path in write_balls(Path(name)).iterdir():
-            picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-            cv2.imwrite(str(path), np.pad(picture, ((0, 0), pads), constant_values=13107))
+            picture = read_image(path)
+            write_image(path, np.pad(picture, ((0, 0), pads), constant_values=13107))
     circles = ["--circle", "60,48,40", "--circle", "240,48,40"]
     result = run("calibrate", "one", "two", *circles)
     assert "the lamps' distances are unknown: they are treated as distant" in result.err
@@ -139,7 +137,7 @@ def test_refusals(refuse):
     cv2.imwrite("dark/1.png", np.full(SIZE, 900, np.uint16))
     write_balls(Path("cut"))
     for path in Path("cut").iterdir():
-        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:, 35:])
+        write_image(path, read_image(path)[:, 35:])
     write_gray(Path("gray"), [1, 1, 0, 1])
     Path("empty").mkdir()
     Path("done").mkdir()
@@ -171,8 +169,8 @@ def test_a_display_encoded_target_is_reported(run):
     write_balls(Path("ball"))
     write_gray(Path("gray"), [1.0, 1.0, 1.0, 1.0])
     for path in Path("gray").glob("[0-9].png"):
-        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        cv2.imwrite(str(path.with_suffix(".jpg")), (picture // 257).astype(np.uint8))
+        picture = read_image(path)
+        write_image(path.with_suffix(".jpg"), (picture // 257).astype(np.uint8))
         path.unlink()
     arguments = ["calibrate", "ball", "--circle", "60,48,40", "--gray-ball", "gray", "--overwrite"]
     asked = run(*arguments, "--transfer", "linear").err  # the option that the warning below names

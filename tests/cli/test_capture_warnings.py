@@ -12,18 +12,27 @@ import numpy as np
 import pytest
 
 import splinecli
-from scenes import shade, sphere, spiral_lights, write_capture
+from scenes import (
+    read_image,
+    read_json,
+    shade,
+    sphere,
+    spiral_lights,
+    to_uint16,
+    write_capture,
+    write_image,
+)
 from splinecli.judge import checks
 from test_notebook import read_medallion
 
 
 def move(path: Path, right: int, down: int) -> None:
-    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    cv2.imwrite(str(path), np.roll(picture, (down, right), axis=(0, 1)))
+    picture = read_image(path)
+    write_image(path, np.roll(picture, (down, right), axis=(0, 1)))
 
 
 def codes() -> list[str]:
-    report = json.loads(Path("out/medallion/report.json").read_text())
+    report = read_json("out/medallion/report.json")
     return [warning["code"] for warning in report["warnings"]]
 
 
@@ -41,8 +50,8 @@ def test_shifted_images_are_named(run, medallion):
     move(medallion / "04.png", 2, -1)
     move(medallion / "09.png", 0, 4)
     words = (
-        "2 of 10 images are shifted against the others, in pixels: 04.png 2 right 1 up, 09.png 4"
-        " down."
+        "2 of 10 images are shifted against the others, in pixels: 04.png 2 right 1 up, 09.png 4 "
+        "down."
     )
     result = run("infer", medallion, "--method", "ls")
     assert result.code == 0 and words in result.err
@@ -60,8 +69,8 @@ def test_the_same_file_under_two_lights(run, medallion):
         shutil.copy(medallion / f"{original}.png", medallion / f"{copy}.png")
     result = run("infer", medallion, "--method", "ls")
     words = (
-        "01.png and 02.png are the same image (and 1 more pair), but their lights differ. Remove"
-        " one,"
+        "01.png and 02.png are the same image (and 1 more pair), but their lights differ. Remove "
+        "one,"
     )
     assert result.code == 0 and words in result.err
     assert codes() == ["repeated_images"]
@@ -110,11 +119,11 @@ def test_images_of_which_the_network_makes_little(run, medallion, monkeypatch):
     monkeypatch.setattr(checks, "LEAST_EXPECTED", 0.3)
     rng = np.random.default_rng(0)
     for path in medallion.glob("[01]*.png"):
-        shape = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).shape
-        cv2.imwrite(str(path), (65_535 * rng.uniform(size=shape) ** 4).astype(np.uint16))
+        shape = read_image(path).shape
+        write_image(path, (65_535 * rng.uniform(size=shape) ** 4).astype(np.uint16))
     mask = np.zeros(shape[:2], np.uint8)
     mask[60:68, 60:68] = 255
-    cv2.imwrite(str(medallion / "mask.png"), mask)
+    write_image(medallion / "mask.png", mask)
     result = run("infer", medallion)
     assert result.code == 0 and "of the normals to be within 5 degrees" in result.err
     assert "low_confidence" in codes()
@@ -148,7 +157,7 @@ LIGHTS = spiral_lights(10, 55, 12)
 def ball(*, background: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Images (F, H, W) from 0 to 1 of a ball before a plane of this brightness, and its mask."""
     normals, mask = sphere(80)
-    normals, mask = (
+    normals, mask = (  # type: ignore[assignment]
         np.pad(array, ((16, 16), (16, 16), *((0, 0),) * (array.ndim - 2)))
         for array in (normals, mask)
     )
@@ -160,7 +169,7 @@ def ball(*, background: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stored(images: np.ndarray, full_scale: int = 65_535) -> np.ndarray:
-    return np.rint(images * full_scale).astype(np.uint16)
+    return to_uint16(images * full_scale)
 
 
 def codes_of(run, *command: object) -> list[str]:
@@ -220,6 +229,6 @@ def test_one_file_of_another_scale(run, others):
         result.code == 3
         and "004.png is 16 times " + ("brighter" if others else "darker") in result.err
     )
-    picture = cv2.imread(str(folder / "004.png"), cv2.IMREAD_UNCHANGED)
-    cv2.imwrite(str(folder / "004.png"), picture // 16 if others else picture * np.uint16(16))
+    picture = read_image(folder / "004.png")
+    write_image(folder / "004.png", picture // 16 if others else picture * np.uint16(16))
     assert "image_scale" not in codes_of(run, folder)

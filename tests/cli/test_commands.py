@@ -8,6 +8,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ from splinecli.records.base import PANELS
 
 
 def test_every_option_stands_in_a_panel():
-    commands = typer.main.get_command(app).commands.values()
+    commands = typer.main.get_command(app).commands.values()  # type: ignore[attr-defined]
     options = [
         one for command in commands for one in command.params if one.param_type_name == "option"
     ]
@@ -161,7 +162,7 @@ def test_an_error_of_the_system_that_no_command_expected(error, expected):
 def test_a_line_every_half_minute_off_a_terminal(capsys, monkeypatch):
     now = 0.0
     monkeypatch.setattr(console, "LINE_SECONDS", 30)
-    monkeypatch.setattr(console.time, "monotonic", lambda: now)
+    monkeypatch.setattr(time, "monotonic", lambda: now)
     with Messages(quiet=False).progress("cat: estimating", 400) as advance:
         for _ in range(400):
             now += 0.25

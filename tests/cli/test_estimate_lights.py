@@ -227,11 +227,7 @@ def test_films_that_cannot_be_used(run):
         ),
         (3, ("none.mp4", "--lights", "estimate"), "the film does not exist"),
         # a name that would lead out of OUT/frames is none of a film
-        (
-            3,
-            ("...mp4", "--lights", "estimate"),
-            "",
-        ),
+        (3, ("...mp4", "--lights", "estimate"), ""),
     ):
         result = run("infer", *arguments)
         assert result.code == code and words in result.err

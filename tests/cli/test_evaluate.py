@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scenes import write_capture
+from scenes import read_json, to_uint16, write_capture, write_image
 from splinecli.maths.normals import unit
 
 
@@ -19,7 +19,7 @@ def dataset(make_capture):
     """
     make_capture("data/matte")
     shaded = make_capture("data/shaded")
-    cv2.imwrite(str(shaded / "image1.png"), np.zeros((24, 24), np.uint16))
+    write_image(shaded / "image1.png", np.zeros((24, 24), np.uint16))
     return Path("data")
 
 
@@ -33,7 +33,7 @@ def test_files_and_table(dataset, run, golden):
         rows = list(csv.DictReader(file))
     found = [(row["method"], row["capture"], row["trials"]) for row in rows]
     assert found == [("ls", "matte", "3"), ("ls", "shaded", "3")]
-    matte, shaded = json.loads(Path("evaluation/results.json").read_text())["results"]
+    matte, shaded = read_json("evaluation/results.json")["results"]
     assert matte["mae_deg"] < 1e-3 < shaded["mae_deg"]
 
 
@@ -51,7 +51,7 @@ def overexposed(make_capture):
         np.clip(0.9 * intensities * (normals @ np.loadtxt(folder / "light_directions.txt").T), 0, 1)
         * 65535
     )
-    pictures = np.rint(np.moveaxis(images, 2, 0)).astype(np.uint16)
+    pictures = to_uint16(np.moveaxis(images, 2, 0))
     return write_capture(
         folder, pictures, None, normals=normals.astype(np.float32), names="image{}.png", first=1
     )

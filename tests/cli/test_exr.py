@@ -4,11 +4,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import tifffile
+from numpy.testing import assert_allclose
 from PIL import Image
+
+from scenes import read_image
 
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -19,7 +21,7 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 @pytest.mark.parametrize("convention", ["opengl", "directx"])
-def test_maps_of_infer(capture: Path, run: Any, convention: str) -> None:
+def test_maps_of_infer(capture, run, convention):
     pytest.importorskip("OpenEXR")
     options = ("--method", "ls", "--maps", "albedo", "--surface", "--convention", convention)
     assert run("infer", capture, *options, "--format", "exr,png,npy,tiff").code == 0
@@ -29,16 +31,14 @@ def test_maps_of_infer(capture: Path, run: Any, convention: str) -> None:
     )
     header, channels = read(out / "normals.exr")
     assert header["normals"] == f"(n + 1) / 2; {green}"
-    picture = cv2.imread(str(out / "normals.png"), cv2.IMREAD_UNCHANGED)[..., ::-1] / 65535
-    np.testing.assert_allclose(
-        np.stack([channels[name] for name in "RGB"], axis=2), picture, atol=1e-5
-    )
+    picture = read_image(out / "normals.png")[..., ::-1] / 65535
+    assert_allclose(np.stack([channels[name] for name in "RGB"], axis=2), picture, atol=1e-5)
     with Image.open(out / "normals.png") as image:
         assert image.info["normals"] == green
     with tifffile.TiffFile(out / "normals.tiff") as file:
         assert file.pages[0].description == "normals: x right, y up, z to the camera; green is y up"
     _, channels = read(out / "albedo.exr")
-    np.testing.assert_allclose(
+    assert_allclose(
         np.stack([channels[n] for n in "RGB"], axis=2), np.load(out / "albedo.npy"), rtol=1e-3
     )
     assert channels["R"].dtype == np.float16

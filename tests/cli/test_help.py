@@ -42,7 +42,7 @@ def test_help_text(command, run, golden):
 
 
 def test_man_pages_are_up_to_date():
-    """Made anew by `python man/make_pages.py`; a page of what is no command any more is to be
+    """Made anew by `python docs/generate.py`; a page of what is no command any more is to be
     removed.
     """
     found = {path.name: path.read_text("utf-8") for path in (REPOSITORY / "man").glob("*.1")}
@@ -67,7 +67,7 @@ def test_man_page_names_what_infer_writes():
 @pytest.mark.parametrize("example", EXAMPLES)
 def test_examples_of_the_man_pages_are_valid(example, run):
     _, command, *args = shlex.split(example)
-    typer.main.get_command(app).commands[command].make_context(command, list(args))
+    typer.main.get_command(app).commands[command].make_context(command, list(args))  # type: ignore[attr-defined]
     if command not in ("prepare", "train"):  # these would begin
         # Past all that is checked about the command line, up to files that are not there.
         assert run(command, *args).code in (3, 4)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from splinecli.cli import main
-from splinecli.cli.signals import GRACE_SECONDS, report_interruption
+from splinecli.cli.signals import GRACE_SECONDS, TOLD, report_interruption
 
 posix = pytest.mark.skipif(os.name == "nt", reason="POSIX files, signals and limits")
 
@@ -98,15 +98,6 @@ def test_a_pipe_that_is_too_long_is_refused_not_cut(capture):
         "found more than 1.0 MB, expected a text file of at most 1.0 MB.\n"
     )
     assert not Path("out").exists()
-
-
-@posix
-def test_a_pipe_in_place_of_stored_scores_is_replaced(capture, run):
-    Path("evaluation").mkdir()
-    os.mkfifo("evaluation/trials.jsonl")
-    result = run("evaluate", capture, "--method", "ls", "--n-lights", 4, "--trials", 1)
-    assert (result.code, result.err) == (0, "")
-    assert Path("evaluation/trials.jsonl").is_file()
 
 
 def test_a_zero_byte_in_a_list_of_images(capture, run):
@@ -195,8 +186,8 @@ def test_memory_that_runs_out_is_one_line(capture, make_capture, run, monkeypatc
     monkeypatch.setattr(cv2, "imdecode", Mock(wraps=cv2.imdecode, side_effect=decoded))
     result = run("infer", capture, "second", "--method", "ls", "-q")
     message = (
-        "splinecli: sphere: there is not enough memory. Close other programs, or use smaller"
-        " images.\n"
+        "splinecli: sphere: there is not enough memory. Close other programs, or use smaller "
+        "images.\n"
     )
     assert (result.code, result.err) == (1, message)
     assert Path("out/second/normals.png").exists()
@@ -250,8 +241,8 @@ def start(code: str) -> subprocess.Popen[str]:
         "print('ready', flush=True)\n    while True:\n        try: time.sleep(60)\n        except"
         " BaseException: pass",
         # A call into C that no signal interrupts.
-        "import numpy; a = numpy.ones((3000, 3000)); print('ready', flush=True)\n    for _ in"
-        " range(60): a @ a",
+        "import numpy; a = numpy.ones((3000, 3000)); print('ready', flush=True)\n"
+        "    for _ in range(60): a @ a",
     ],
 )
 def test_sigterm_always_ends_a_process(code):
@@ -287,10 +278,7 @@ def test_the_dependencies_have_no_known_holes():
         "pillow": (12, 3),  # writes beyond buffers, and bombs, in many formats
         "jinja2": (3, 1, 6),  # CVE-2025-27516
         # CVE-2025-53644: writes beyond a buffer in 4.10 and 4.11
-        "opencv-python-headless": (
-            4,
-            12,
-        ),
+        "opencv-python-headless": (4, 12),
         "safetensors": (0, 5),
     }.items():
         assert floors[name] >= floor, name
@@ -322,7 +310,7 @@ __main__.run()
 
 @posix
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_a_library_that_swallows_interrupts_while_it_is_imported(tmp_path: Path, name: str) -> None:
+def test_a_library_that_swallows_interrupts_while_it_is_imported(tmp_path, name):
     (tmp_path / "library.py").write_text(LIBRARY.format(signal=name))
     done = subprocess.run(
         [sys.executable, "-c", IMPORTING], cwd=tmp_path, capture_output=True, text=True, timeout=60
@@ -334,7 +322,7 @@ def test_a_library_that_swallows_interrupts_while_it_is_imported(tmp_path: Path,
     )
 
 
-def test_libraries_print_nothing(tmp_path: Path) -> None:
+def test_libraries_print_nothing(tmp_path):
     command = """
 import logging, sys, warnings
 from splinecli import __main__
@@ -355,10 +343,10 @@ __main__.run()
 def test_an_interruption_is_told_once(capfd, monkeypatch):
     """The thread that ends the process after a SIGTERM may come when the command has told of it."""
     monkeypatch.setattr(
-        main.typer.main, "get_command", lambda _: type("Stub", (), {"main": lambda *_, **__: 130})
+        "typer.main.get_command", lambda _: type("Stub", (), {"main": lambda *_, **__: 130})
     )
     try:
         assert main.main([]) == report_interruption() == 130
     finally:
-        main.TOLD.clear()
+        TOLD.clear()
     assert capfd.readouterr().err == "splinecli: interrupted.\n"

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from scenes import to_uint16
 from splinecli.evaluation.trials import TrialStore
 from system.test_publishing import LINKS
 
@@ -82,7 +83,7 @@ def inputs(capture, monkeypatch):
     for number in range(3):
         spot = np.exp(-((x - 50 - 10 * number) ** 2 + (y - 48) ** 2) / 20)
         picture = np.where(np.hypot(x - 60, y - 48) < 40, 0.02 + 0.9 * spot, 0.2)
-        cv2.imwrite(f"ball/{number}.png", np.rint(picture * 65535).astype(np.uint16))
+        cv2.imwrite(f"ball/{number}.png", to_uint16(picture * 65535))
     return capture
 
 
@@ -136,7 +137,7 @@ def test_nothing_outside_of_the_folder_changes(inputs, run, name, plant):
 
 
 def test_trials_go_on_in_a_file_of_their_own(tmp_path):
-    """Neither through a link nor through another name of the same file; whole lines stay."""
+    """Neither through a link, another name of the same file, nor a pipe; whole lines stay."""
     line = (
         json.dumps({"key": "a", "mae_deg": 1.0, "seconds": 1.0, "estimated_intensities": False})
         + "\n"
@@ -151,6 +152,10 @@ def test_trials_go_on_in_a_file_of_their_own(tmp_path):
     TrialStore(path)
     assert (path.read_text(), path.is_symlink()) == ("", False)
     assert elsewhere.read_text() == line + line[:20]
+    path.unlink()
+    os.mkfifo(path)
+    TrialStore(path)
+    assert path.is_file()
 
 
 def test_something_else_in_place_of_a_lock_fails_its_capture_only(inputs, run):

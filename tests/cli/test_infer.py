@@ -2,7 +2,6 @@
 wrong.
 """
 
-import json
 import os
 import subprocess
 import sys
@@ -15,8 +14,10 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from numpy.testing import assert_allclose, assert_array_equal
 
 from cli.conftest import EXAMPLE, read_report
+from scenes import read_image, read_json, to_uint16, write_image
 from splinecli.capture.files import IMAGE_SUFFIXES
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.maths.normals import angle_between_deg, decode_picture
@@ -34,7 +35,7 @@ from splinecli.records.output_files import (
 def test_writes_the_contract(capture, truth, run, golden):
     result = run("infer", capture, "--method", "ls", "--format", "png,npy,tiff")
     assert (result.code, result.err) == (0, "")
-    seconds = json.loads(Path("out/sphere/report.json").read_text())["seconds"]
+    seconds = read_json("out/sphere/report.json")["seconds"]
     line = "out/sphere: 448 pixels, 8 lights, ls, MAE 0.00 deg (median 0.00)"
     assert result.out == f"{line}, {seconds['total']:.1f} s\n"
     assert sum(seconds.values()) == pytest.approx(2 * seconds["total"], abs=0.01)
@@ -49,8 +50,8 @@ def test_writes_the_contract(capture, truth, run, golden):
     # 5e-3.
     assert angle_between_deg(normals[mask], truth[mask]).max() < 5e-3
     assert not normals[~mask].any()
-    np.testing.assert_array_equal(tifffile.imread(out / "normals.tiff"), normals)
-    picture = cv2.imread(str(out / "normals.png"), cv2.IMREAD_UNCHANGED)[..., ::-1]
+    assert_array_equal(tifffile.imread(out / "normals.tiff"), normals)
+    picture = read_image(out / "normals.png")[..., ::-1]
     assert picture.dtype == np.uint16
     assert angle_between_deg(decode_picture(picture)[mask], normals[mask]).max() < 5e-3
     assert cv2.imread(str(out / "error_map.png")).shape[0] >= mask.shape[0]
@@ -63,7 +64,7 @@ def test_albedo_and_preview_where_they_are_asked_for(capture, run):
     albedo = np.load(out / "albedo.npy")
     mask = mask_of(capture) > 0
     # The sphere is 60000 / 65535 white.
-    np.testing.assert_allclose(albedo[mask], 60_000 / 65_535, atol=2e-3)
+    assert_allclose(albedo[mask], 60_000 / 65_535, atol=2e-3)
     assert not albedo[~mask].any()
     assert cv2.imread(str(out / "albedo.png"))[mask].min() >= 254
     preview = cv2.imread(str(out / "preview.png"), cv2.IMREAD_GRAYSCALE)
@@ -99,8 +100,8 @@ def test_how_sure_the_network_is(capture, run):
     assert report["angular_error_deg"]["under_5"] == 1
     assert 0.5 < confidence[mask].mean() < 1
     assert report["expected_under_5"] == pytest.approx(confidence[mask].mean(), abs=1e-4)
-    picture = cv2.imread(str(out / "confidence.png"), cv2.IMREAD_UNCHANGED)
-    np.testing.assert_array_equal(picture, np.rint(255 * confidence))
+    picture = read_image(out / "confidence.png")
+    assert_array_equal(picture, np.rint(255 * confidence))
     assert 'alt="Confidence map"' in (out / "page.html").read_text("utf-8")
     (capture / "normals_gt.npy").unlink()
     said = run("infer", capture, "--overwrite").out
@@ -115,8 +116,8 @@ def darken_background(capture):
     """Make the images nearly black outside of the mask, and return this."""
     mask = mask_of(capture)
     for path in capture.glob("image*.png"):
-        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        cv2.imwrite(str(path), np.where(mask > 0, picture, 300).astype(np.uint16))
+        picture = read_image(path)
+        write_image(path, np.where(mask > 0, picture, 300).astype(np.uint16))
     return mask
 
 
@@ -137,7 +138,7 @@ def test_a_mask_is_found_where_there_is_none(capture, run, document):
     )
     assert (both.code, "contradict each other. Leave one out" in both.err) == (2, True)
     for path in capture.glob("image*.png"):
-        cv2.imwrite(str(path), np.full(mask.shape, 30_000, np.uint16))
+        write_image(path, np.full(mask.shape, 30_000, np.uint16))
     nothing = run("infer", capture, "--method", "ls", "--auto-mask", "-o", "third")
     assert (nothing.code, "no mask was found" in nothing.err, "--mask" in nothing.err) == (
         3,
@@ -149,8 +150,8 @@ def test_a_mask_is_found_where_there_is_none(capture, run, document):
 def test_photographs_with_a_curve_and_ambient_light(capture, document):
     light = 9_000 / 65_535
     for path in capture.glob("image*.png"):
-        linear = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) / 65_535 * 0.8 + light
-        cv2.imwrite(str(path), np.rint(65_535 * linear ** (1 / 2.2)).astype(np.uint16))
+        linear = read_image(path) / 65_535 * 0.8 + light
+        write_image(path, to_uint16(65_535 * linear ** (1 / 2.2)))
     dark = np.full((24, 24), round(65_535 * light ** (1 / 2.2)), np.uint16)
     cv2.imwrite("dark.png", dark)
 
@@ -158,7 +159,7 @@ def test_photographs_with_a_curve_and_ambient_light(capture, document):
     assert report()["angular_error_deg"]["mean"] > 5
     given = ("--transfer", "gamma:2.2", "--ambient", "dark.png")
     assert report(*given)["angular_error_deg"]["mean"] < 0.1
-    cv2.imwrite(str(capture / "ambient.png"), dark)
+    write_image(capture / "ambient.png", dark)
     found = report(*given[:2])
     assert found["angular_error_deg"]["mean"] < 0.1
     text = "ambient.png was subtracted from all images as ambient light."
@@ -175,9 +176,7 @@ def test_a_mended_mask_stays(capture, document):
     cv2.imwrite("out/sphere/found_mask.png", painted)
     mended = ("--mask", "out/sphere/found_mask.png", "--overwrite")
     assert document("infer", capture, "--method", "ls", *mended)["n_pixels"] == 100
-    np.testing.assert_array_equal(
-        cv2.imread("out/sphere/found_mask.png", cv2.IMREAD_UNCHANGED), painted
-    )
+    assert_array_equal(cv2.imread("out/sphere/found_mask.png", cv2.IMREAD_UNCHANGED), painted)
 
 
 @pytest.mark.parametrize(
@@ -191,9 +190,7 @@ def test_a_found_mask_of_a_part_is_a_mask_of_the_capture(capture, run, part):
     assert found.shape == mask.shape
     given = ("--mask", "out/sphere/found_mask.png", "-o", "again")
     assert run("infer", capture, "--method", "ls", *given, *part).code == 0
-    np.testing.assert_array_equal(
-        np.load("again/sphere/normals.npy"), np.load("out/sphere/normals.npy")
-    )
+    assert_array_equal(np.load("again/sphere/normals.npy"), np.load("out/sphere/normals.npy"))
     # It is a mask of whole images, too, without gaps between the rows that were read.
     assert run("infer", capture, "--method", "ls", *given, "--overwrite").code == 0
     assert read_report(Path("again/sphere"))["n_pixels"] == np.count_nonzero(found)
@@ -237,7 +234,7 @@ def test_interrupted_while_estimating(capture, run, monkeypatch):
 def test_closed_streams_and_ascii_terminals(capture, make_capture):
     make_capture("naïve ☃")
 
-    def call(name: str, redirection: str) -> int:
+    def call(name, redirection):
         command = (
             f'"{sys.executable}" -m splinecli infer "{name}" --method ls --overwrite {redirection}'
         )
@@ -263,13 +260,13 @@ def test_scales_of_pictures(capture, run, maps, scales):
     assert np.isfinite(np.load(f"out/{capture.name}/gradient.npy")).sum() == 2 * 448
     for name in ("gradient", "relief", "curvature"):
         tiff = tifffile.imread(f"out/{capture.name}/{name}.tiff")
-        np.testing.assert_array_equal(tiff, np.load(f"out/{capture.name}/{name}.npy"))
+        assert_array_equal(tiff, np.load(f"out/{capture.name}/{name}.npy"))
     for name, scale in zip(("relief", "curvature"), scales, strict=True):
         values = np.atleast_3d(np.load(f"out/{capture.name}/{name}.npy"))[..., 0]
         assert (values.dtype, np.isfinite(values).sum()) == (np.float32, 448)
         picture = cv2.imread(f"out/{capture.name}/{name}.png", cv2.IMREAD_UNCHANGED)
         expected = 127.5 + 127.5 * np.clip(np.nan_to_num(values) / scale, -1, 1)
-        np.testing.assert_allclose(picture, expected, atol=0.51)
+        assert_allclose(picture, expected, atol=0.51)
 
 
 @pytest.mark.parametrize(
@@ -307,7 +304,7 @@ def test_no_result_beside_the_images_counts_as_one_of_them(run, document, captur
     assert run("integrate", capture, "--format", ",".join(surface), "--overwrite").code == 0
     for name in (*PLOTS, LIGHT_PLOT, ERROR_MAP, "confidence.png", FOUND_MASK):
         if not (capture / name).exists():
-            cv2.imwrite(str(capture / name), np.zeros((24, 24), np.uint8))
+            write_image(capture / name, np.zeros((24, 24), np.uint8))
     pictures = {path.name for path in capture.glob("*") if path.suffix in IMAGE_SUFFIXES} - {
         "mask.png"
     }

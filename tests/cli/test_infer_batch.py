@@ -142,11 +142,27 @@ def test_a_folder_that_is_given_twice_counts_once(capture, run):
         (("--weights", "spline-net"), 2, "method ls uses no weights"),
         (("--maps", "confidence"), 2, "method ls does not provide confidence"),
         (("--update", "--overwrite"), 2, "--overwrite and --update contradict each other"),
+        (("--workers", "0"), 2, "--workers is '0'; expected a number of at least 1, or auto"),
+        (("--workers", "many"), 2, "--workers is 'many'; expected a number of at least 1, or auto"),
+        (
+            ("--workers", "2", "--cluster", "tcp://a:1"),
+            2,
+            "--workers and --cluster contradict each other",
+        ),
+        (("--shard", "3/2"), 2, "--shard is 3/2; expected I/N with I from 1 to N"),
+        (("--shard", "half"), 2, "--shard is 'half'; expected I/N"),
+        (
+            ("--cluster", "none.json"),
+            2,
+            "--cluster is none.json; expected an address such as tcp://scheduler:8786",
+        ),
     ],
 )
 def test_arguments_are_checked_before_the_first_capture(
     arguments, code, message, capture, make_capture, run, monkeypatch
 ):
+    if "--cluster" in arguments:
+        pytest.importorskip("distributed", reason="needs the extra 'cluster'")
     make_capture("second")
     touched = []
     monkeypatch.setattr(
@@ -154,7 +170,7 @@ def test_arguments_are_checked_before_the_first_capture(
     )
     call = ("infer", capture, "second", "--method", "ls", *arguments)
     result = run(*call)
-    assert (result.code, result.out, touched) == (code, "", [])
+    assert (result.code, result.out, touched, result.err.count("\n")) == (code, "", [], 1)
     assert message in result.err
     assert not Path("out").exists()
     documents = json.loads(run(*call, "--json").out)
@@ -202,7 +218,7 @@ def test_the_pipeline_reports_to_an_observer(capture, make_capture):
     (capture / "mask.png").unlink()
 
     class Recorder(Observer):
-        def __init__(self) -> None:
+        def __init__(self):
             self.bars: dict[str, list[tuple[float, str]]] = {}
 
         @contextmanager
@@ -313,7 +329,7 @@ def test_a_failure_is_that_of_its_capture(place, make_capture, run, monkeypatch)
     names = [str(make_capture(name)) for name in (*FAILURES, "good")]
     errors, original = iter([error for error, _ in FAILURES.values()]), getattr(*place)
 
-    def fail(*arguments: object, **options: object) -> object:
+    def fail(*arguments, **options):
         if (error := next(errors, None)) is not None:
             raise error
         return original(*arguments, **options)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scenes import spiral_lights, write_capture
+from scenes import read_image, spiral_lights, to_uint16, write_capture, write_image
 
 
 def test_the_report_of_a_capture(run, capture):
@@ -38,7 +38,7 @@ def test_the_same_as_json(document, capture):
 
 def test_few_lights_near_the_axis(run, document, truth):
     lights = spiral_lights(6, 20)
-    images = np.rint(np.moveaxis(truth @ lights.T, 2, 0).clip(0) * 60_000).astype(np.uint16)
+    images = to_uint16(np.moveaxis(truth @ lights.T, 2, 0).clip(0) * 60_000)
     write_capture(Path("near"), images, lights, mask=truth[..., 2] > 0.3)
     warnings = [
         "There are 6 lights; use 8 or more, well spread.",
@@ -65,8 +65,8 @@ def test_the_camera_of_exif(run, document):
     assert report["camera_matrix"] is None
     assert report["exif_camera_matrix"] == [[500, 0, 179.5], [0, 500, 119.5], [0, 0, 1]]
     words = (
-        "treated as orthographic; EXIF suggests a --camera-matrix with the rows 500 0 179.5, 0 500"
-        " 119.5, 0 0 1"
+        "treated as orthographic; EXIF suggests a --camera-matrix with the rows 500 0 179.5, 0 500 "
+        "119.5, 0 0 1"
     )
     assert f"camera       {words}" in run("info", "photographs").out
 
@@ -80,14 +80,14 @@ def test_the_plot_of_the_lights(run, capture):
 
 def test_warnings(run, capture):
     photographs = sorted(capture.glob("image*.png"))
-    stored = cv2.imread(str(photographs[0]), cv2.IMREAD_UNCHANGED)
-    cv2.imwrite(str(photographs[0]), (stored // 256).astype(np.uint8))
-    cv2.imwrite(str(photographs[1]), np.full_like(stored, 65_535))
-    cv2.imwrite(str(photographs[2]), stored // 30)
+    stored = read_image(photographs[0])
+    write_image(photographs[0], (stored // 256).astype(np.uint8))
+    write_image(photographs[1], np.full_like(stored, 65_535))
+    write_image(photographs[2], stored // 30)
     warnings = json.loads(run("info", str(capture), "--json").out)["warnings"]
     words = ("8 bits", "image2.png (100.0 %)", "5 % of the range: 1, such as image3.png")
     assert all(word in warning for word, warning in zip(words, warnings[:3], strict=True))
-    cv2.imwrite(str(photographs[3]), stored[:20])
+    write_image(photographs[3], stored[:20])
     result = run("info", str(capture), "--json")
     assert (
         result.code,
@@ -108,15 +108,12 @@ def test_the_plot_replaces_no_photograph(run, capture):
 def test_the_white_level_of_12_bit_data(run, document, capture):
     """Clipped at 4095, no value reaches the full scale of the files, and yet many are saturated."""
     for path in capture.glob("image*.png"):
-        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(float)
-        cv2.imwrite(str(path), np.minimum(stored * 1.2 / 16, 4095).astype(np.uint16))
+        stored = read_image(path).astype(float)
+        write_image(path, np.minimum(stored * 1.2 / 16, 4095).astype(np.uint16))
     assert "white level  4095, found in the images\n" in run("info", capture).out
     report = document("info", capture)
-    mask = cv2.imread(str(capture / "mask.png"), cv2.IMREAD_UNCHANGED) > 0
-    shares = [
-        (cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[mask] == 4095).mean()
-        for path in capture.glob("image*.png")
-    ]
+    mask = read_image(capture / "mask.png") > 0
+    shares = [(read_image(path)[mask] == 4095).mean() for path in capture.glob("image*.png")]
     assert max(shares) > 0.1 and report["exposure"]["saturated"] == pytest.approx(
         max(shares), abs=1e-4
     )
@@ -126,8 +123,8 @@ def test_the_white_level_of_12_bit_data(run, document, capture):
 def test_auto_mask(document, capture):
     (capture / "mask.png").unlink()
     for path in capture.glob("image*.png"):
-        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        stored = read_image(path)
         stored[:, :8] = 0
-        cv2.imwrite(str(path), stored)
+        write_image(path, stored)
     report = document("info", capture, "--auto-mask")
     assert (report["mask"], report["n_pixels"]) == ("found in the images", 24 * 16)

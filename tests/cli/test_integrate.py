@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
-from scenes import BUMP_LAMPS, write_bump
+from scenes import BUMP_LAMPS, read_json, write_bump
 from splinecli.capture.formats import images
 from splinecli.maths.normals import encode_picture
 from splinecli.pipeline.infer import results_bytes
@@ -49,8 +50,8 @@ def test_heights_and_mesh_of_a_sphere(run):
     inside, depth = sphere()[2], np.load("out/depth.npy")
     assert (depth.dtype, depth.shape) == (np.float32, SHAPE)
     check_heights(depth)
-    np.testing.assert_array_equal(tifffile.imread("out/depth.tiff"), depth)
-    report = json.loads(Path("out/surface.json").read_text())
+    assert_array_equal(tifffile.imread("out/depth.tiff"), depth)
+    report = read_json("out/surface.json")
     assert report["n_pixels"] == inside.sum()
     assert report["files"] == [
         "mesh.ply",
@@ -94,7 +95,7 @@ def test_the_convention_of_a_folder_is_recognised(run, capture, form, given):
         result = run("integrate", f"{convention}/sphere", "--format", "npy", "-q", *more)
         assert (result.code, result.out, result.err) == (0, "", "")
         depths.append(np.load(f"{convention}/sphere/depth.npy"))
-    np.testing.assert_allclose(*depths, atol=0.2)
+    assert_allclose(*depths, atol=0.2)
     assert np.nanmax(depths[0]) - np.nanmin(depths[0]) > 1
 
 
@@ -155,9 +156,7 @@ def test_a_prior(run, form):
     ]
     report = json.loads(run("integrate", *arguments).out)
     assert (report["prior"], report["unit"]) == (prior, "millimetre")
-    np.testing.assert_allclose(
-        np.load("out/depth.npy")[inside], 0.5 * (heights + 100)[inside], atol=0.2
-    )
+    assert_allclose(np.load("out/depth.npy")[inside], 0.5 * (heights + 100)[inside], atol=0.2)
 
 
 def with_one(value: float, every: int = 1) -> np.ndarray:
@@ -247,11 +246,11 @@ def test_a_folder_of_results_gives_the_surface_of_infer(run, capture, view):
     assert {name: again[name] for name in report["surface"]} == report["surface"]
     # Normals that are read are scaled to unit length again, which may change their last bit.
     depths = [np.load(place / "depth.npy") for place in places]
-    np.testing.assert_allclose(*depths, rtol=1e-5, atol=1e-5)
+    assert_allclose(*depths, rtol=1e-5, atol=1e-5)
     for name in ("mesh.ply", "mesh.glb"):
         one, other = (trimesh.load(place / name, force="mesh", process=False) for place in places)
-        np.testing.assert_allclose(one.vertices, other.vertices, rtol=1e-5, atol=1e-5)
-        np.testing.assert_array_equal(one.faces, other.faces)
+        assert_allclose(one.vertices, other.vertices, rtol=1e-5, atol=1e-5)  # type: ignore[attr-defined]
+        assert_array_equal(one.faces, other.faces)  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("size", [["--pixel-size", "2e-9"], ["--object-width", "64e-9"]])
@@ -312,10 +311,10 @@ def test_a_picture_of_the_depth(run):
     picture, depth = cv2.imread("out/depth.png", cv2.IMREAD_UNCHANGED), np.load("out/depth.npy")
     low, high = report["range"]
     assert (picture.dtype, report["unit"]) == (np.uint16, "millimetre")
-    np.testing.assert_array_equal(picture == 0, np.isnan(depth))
+    assert_array_equal(picture == 0, np.isnan(depth))
     inside = picture > 0
     read = low + (picture[inside] - 1.0) / 65_534 * (high - low)
-    np.testing.assert_allclose(read, depth[inside], atol=(high - low) / 65_534)
+    assert_allclose(read, depth[inside], atol=(high - low) / 65_534)
     assert (picture[inside].min(), picture.max()) == (1, 65_535)
     with Image.open("out/depth.png") as opened:
         assert f"1 = {low:.7g}, 65535 = {high:.7g}; unit: millimetre" in opened.info["depth"]
@@ -343,7 +342,7 @@ def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monke
     assert not Path("out/sphere/report.json").exists()
 
     assert run("infer", capture, "--method", "ls", "--overwrite").code == 0
-    n_pixels = json.loads(Path("out/sphere/report.json").read_text())["n_pixels"]
+    n_pixels = read_json("out/sphere/report.json")["n_pixels"]
     assert results_bytes(n_pixels, 5, surface=True) - results_bytes(n_pixels, 5) == n_pixels * 600
     monkeypatch.setattr(images, "available_memory", lambda: n_pixels * 600.0)
     assert run("integrate", "out/sphere").code == 0
@@ -355,7 +354,7 @@ def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monke
 def test_a_damaged_report_is_named(run, capture):
     assert run("infer", capture, "--method", "ls", "--format", "npy", "--surface").code == 0
     path = Path("out", capture, "report.json")
-    whole = json.loads(path.read_text())
+    whole = read_json(path)
     for where, key, value in (
         ("options", "crop", 5),
         ("options", "scale", 3),
@@ -384,10 +383,7 @@ def test_a_damaged_report_is_named(run, capture):
             3,
             1,
             True,
-        ), (
-            key,
-            value,
-        )
+        ), (key, value)
 
 
 def test_refusals(refuse):
@@ -418,6 +414,6 @@ def test_refusals(refuse):
         (3, ["normals.npy", "--camera-matrix", "mirrored.txt"]),
         (5, ["normals.npy", "-o", "done"]),
     )
-    cases = [(code, words if "-o" in words else [*words, "-o", "out"]) for code, words in cases]
-    refuse("integrate", cases, "integrate_refusals.txt")
+    placed = [(code, words if "-o" in words else [*words, "-o", "out"]) for code, words in cases]
+    refuse("integrate", placed, "integrate_refusals.txt")
     assert not Path("out").exists()

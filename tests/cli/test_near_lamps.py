@@ -5,12 +5,11 @@ the lamps are.
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from cli.test_schema import check
-from scenes import BUMP_LAMPS, BUMP_MM, write_bump
+from scenes import BUMP_LAMPS, BUMP_MM, read_image, write_bump, write_image
 
 
 @pytest.fixture
@@ -28,7 +27,7 @@ def mean_error(infer):
     return lambda *arguments: infer(*arguments)["angular_error_deg"]["mean"]
 
 
-def test_one_distance_for_all_lamps(mean_error, bump: Path) -> None:
+def test_one_distance_for_all_lamps(mean_error, bump):
     positions = 170 * BUMP_LAMPS / np.linalg.norm(BUMP_LAMPS, axis=1, keepdims=True)
     write_bump(bump, positions)
     np.savetxt(bump / "light_directions.txt", positions / 170)
@@ -45,7 +44,7 @@ def near(bump: Path) -> Path:
     return bump
 
 
-def test_files_and_options_mean_the_same(run, infer, mean_error, near: Path) -> None:
+def test_files_and_options_mean_the_same(run, infer, mean_error, near):
     report = infer()
     assert report["angular_error_deg"]["mean"] < 0.1
     assert [warning["code"] for warning in report["warnings"]] == ["few_lights"]
@@ -73,7 +72,7 @@ def test_files_and_options_mean_the_same(run, infer, mean_error, near: Path) -> 
     assert mean_error("--lights", "lamps.txt") > 5
 
 
-def test_distant_lights_despite_positions_are_warned_of(infer, near: Path) -> None:
+def test_distant_lights_despite_positions_are_warned_of(infer, near):
     np.savetxt("directions.txt", BUMP_LAMPS)
     warning, _ = infer("--lights", "directions.txt")["warnings"]
     assert warning["code"] == "near_lamps"
@@ -103,14 +102,14 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("arguments", "code", "message"), REFUSED)
-def test_refused_options(run, bump: Path, arguments: str, code: int, message: str) -> None:
+def test_refused_options(run, bump, arguments, code, message):
     np.savetxt(bump / "light_directions.txt", BUMP_LAMPS)
     np.savetxt("l.txt", BUMP_LAMPS)
     result = run("infer", "bump", "--method", "ls", *arguments.split())
     assert (result.code, message in result.err) == (code, True), result.err
 
 
-def test_wrong_files_are_named(run, near: Path) -> None:
+def test_wrong_files_are_named(run, near):
     for name, text, message in (
         ("pixel_size.txt", "1 2\n", 'pixel_size.txt:1: found "1 2", expected one number above 0'),
         (
@@ -156,7 +155,7 @@ def test_wrong_files_are_named(run, near: Path) -> None:
         (near / name).unlink()
 
 
-def test_a_near_camera_under_distant_lights(run, document, infer, mean_error, bump: Path) -> None:
+def test_a_near_camera_under_distant_lights(run, document, infer, mean_error, bump):
     """The camera is in the report, and comes from the option or the folder. A changed matrix
     changes the capture.
     """
@@ -181,7 +180,7 @@ def test_a_near_camera_under_distant_lights(run, document, infer, mean_error, bu
     assert scored["mae_deg"] != pytest.approx(mean_error("--method", "ia14"), abs=1e-3)
 
 
-def test_a_file_of_lobes(run, infer, mean_error, near: Path) -> None:
+def test_a_file_of_lobes(run, infer, mean_error, near):
     """One line is for all lamps. The frame of the positions is that of the lobes, too."""
     without = infer()
     (near / "light_lobes.txt").write_text("0 0.2 -1 0\n")
@@ -201,7 +200,7 @@ def test_a_file_of_lobes(run, infer, mean_error, near: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["infer", "info"])
-def test_positions_in_another_unit_than_the_pixel_size(run, near: Path, command: str) -> None:
+def test_positions_in_another_unit_than_the_pixel_size(run, near, command):
     """The bump is 64 mm wide, its lamps 162 mm away and more: in metres they would be inside the
     bump.
     """
@@ -232,10 +231,10 @@ def test_positions_in_another_unit_than_the_pixel_size(run, near: Path, command:
     assert run(*arguments, "--strict").code == 0
 
 
-def test_evaluate_and_prepare(run, document, near: Path) -> None:
+def test_evaluate_and_prepare(run, document, near):
     """Scoring a sample of the pixels finds the surface from all of them."""
 
-    def error(words: str) -> float:
+    def error(words):
         return document("evaluate", "bump", "--method", "ls", "--trials", 1, *words.split())[
             "results"
         ][0]["mae_deg"]
@@ -246,13 +245,13 @@ def test_evaluate_and_prepare(run, document, near: Path) -> None:
     assert refused.code == 3 and "near lamps, and training needs distant lights" in refused.err
 
 
-def test_albedo_and_saturation(infer, near: Path) -> None:
+def test_albedo_and_saturation(infer, near):
     """The bump has one albedo, and pixels that are clipped at 70 % of the brightest are
     restored.
     """
     for path in near.glob("*.png"):
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        cv2.imwrite(str(path), np.minimum(image, 26_000))
+        image = read_image(path)
+        write_image(path, np.minimum(image, 26_000))
     stored = infer("--white-level", "26000", "--as-stored")
     restored = infer("--white-level", "26000", "--maps", "albedo")
     assert restored["angular_error_deg"]["mean"] < 0.5 * stored["angular_error_deg"]["mean"]

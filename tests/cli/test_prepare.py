@@ -7,9 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from capture.test_cyclesps import normals, write_object
 from kills import content
+from scenes import read_image, read_json, write_image
 
 
 @pytest.fixture
@@ -36,9 +38,9 @@ def test_a_capture(run, capture, truth):
     found = arrays("sphere")
     mask = found["mask"]
     assert (mask.shape, mask.sum()) == ((24, 24), 448)
-    np.testing.assert_allclose(found["normals"], truth[mask], atol=1e-6)
+    assert_allclose(found["normals"], truth[mask], atol=1e-6)
     expected = (truth[mask] @ found["light_directions"].T) * 60_000 / 65_535
-    np.testing.assert_allclose(found["observations"], expected, atol=1e-5)
+    assert_allclose(found["observations"], expected, atol=1e-5)
 
 
 def test_a_cycles_tree_reads_to_the_values_put_in(document, cycles_images):
@@ -49,16 +51,14 @@ def test_a_cycles_tree_reads_to_the_values_put_in(document, cycles_images):
     expected = {
         kind: images.mean(axis=3)[:, 1:6, 2:9] / 65535 for kind, images in cycles_images.items()
     }
-    np.testing.assert_allclose(
-        whole["observations"], expected["diffuse"].reshape(4, 35).T, rtol=1e-6
-    )
+    assert_allclose(whole["observations"], expected["diffuse"].reshape(4, 35).T, rtol=1e-6)
     # 16 bits
-    np.testing.assert_allclose(whole["normals"], normals()[1:6, 2:9].reshape(35, 3), atol=2.5e-5)
+    assert_allclose(whole["normals"], normals()[1:6, 2:9].reshape(35, 3), atol=2.5e-5)
     # PRPS gives rows 2 and 4 and columns 2, 4, 6 and 8, as in the training of CNN-PS.
     inner = expected["specular"][:, 1::2, ::2].reshape(4, 8).T
-    np.testing.assert_allclose(half["observations"], inner, rtol=1e-6)
+    assert_allclose(half["observations"], inner, rtol=1e-6)
     assert half["mask"].shape == (4, 6)
-    manifest = json.loads(Path("set/manifest.json").read_text())
+    manifest = read_json("set/manifest.json")
     assert {entry["scene"] for entry in manifest["entries"]} == {"Turtle"}
     assert manifest["complete"] is True
 
@@ -128,15 +128,15 @@ def test_a_changed_capture_is_named_and_read_again_with_update(run, make_capture
 
 def test_saturated_pixels_are_restored_unless_as_stored(run, capture):
     # One light is 1.4 times as bright, so that some pixels of its image are clipped at 65535.
-    picture = cv2.imread(str(capture / "image2.png"), cv2.IMREAD_UNCHANGED).astype(np.float64)
-    cv2.imwrite(str(capture / "image2.png"), (1.4 * picture).clip(0, 65535).astype(np.uint16))
+    picture = read_image(capture / "image2.png").astype(np.float64)
+    write_image(capture / "image2.png", (1.4 * picture).clip(0, 65535).astype(np.uint16))
     np.savetxt(capture / "light_intensities.txt", [[1.4 if i == 1 else 1] * 3 for i in range(8)])
     assert run("prepare", capture, "-o", "set", "--quiet").code == 0
     assert run("prepare", capture, "-o", "raw", "--as-stored", "--quiet").code == 0
     found, stored = arrays("sphere"), np.load("raw/sphere/observations.npy")
     expected = found["normals"] @ found["light_directions"].T * 60_000 / 65_535  # a matte sphere
     assert (np.abs(stored - expected).max(axis=1) > 0.01).sum() > 20
-    np.testing.assert_allclose(found["observations"], expected, atol=2e-3)
+    assert_allclose(found["observations"], expected, atol=2e-3)
     # The two readings do not share an entry.
     refused = run("prepare", capture, "-o", "raw")
     assert (
@@ -167,7 +167,7 @@ def test_scenes_and_a_mesh_are_rendered(run, cube, monkeypatch):
         assert found["observations"].dtype == np.float16
         assert found["observations"].shape == (found["mask"].sum(), 20)
         assert (found["observations"] >= 0).all() and found["observations"].max() > 0
-        np.testing.assert_allclose(np.linalg.norm(found["normals"], axis=1), 1, atol=1e-5)
+        assert_allclose(np.linalg.norm(found["normals"], axis=1), 1, atol=1e-5)
     # The middle of the cube's top looks at the camera.
     normal_map = np.zeros((16, 16, 3))
     normal_map[found["mask"]] = found["normals"]

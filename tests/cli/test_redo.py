@@ -13,7 +13,7 @@ from unittest.mock import Mock
 import pytest
 
 from cli.conftest import read_report
-from splinecli.cli import infer as watch
+from scenes import read_json
 from splinecli.pipeline.batch import infer_batch
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.system.files import UNFINISHED
@@ -105,7 +105,7 @@ def link_elsewhere(path: Path) -> None:
 
 
 def surrogate_among_files(path: Path) -> None:
-    report = json.loads(path.read_text())
+    report = read_json(path)
     path.write_text(json.dumps({**report, "files": ["\ud800"]}))
 
 
@@ -198,16 +198,14 @@ def test_bad_reports_of_other_captures_are_no_matter(capture, make_capture, run)
     Path("kept").touch()
     for name, (key, value) in zip(names, BAD_REPORTS, strict=True):
         path = Path("out", name, "report.json")
-        path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
+        path.write_text(json.dumps({**read_json(path), key: value}))
     result = run("infer", capture, make_capture("third"), "--method", "ls")
     assert (result.code, "Traceback" in result.err) == (0, False)
     page = Path("out/index.html").read_text("utf-8")
     assert "sphere" in page and "third" in page
     # The same where the captures themselves come next.
     assert run("infer", *names, "--method", "ls", "--update").code == 0
-    assert [
-        json.loads(Path("out", name, "report.json").read_text())["capture"] for name in names
-    ] == names
+    assert [read_json(Path("out", name, "report.json"))["capture"] for name in names] == names
     assert Path("kept").is_file()
 
 
@@ -232,19 +230,19 @@ def test_other_weights_in_the_home_folder(capture, monkeypatch, tmp_path):
 
 def test_captures_are_computed_as_they_arrive_and_only_once(
     run, capture, make_capture, monkeypatch
-) -> None:
+):
     """Something happens at each look at the folder; then Ctrl-C."""
     parts = Path("parts")
     (parts / "bad").mkdir(parents=True)
     (parts / "bad/done").touch()
 
-    def look(steps: list) -> None:
-        def sleep(seconds: float) -> None:
+    def look(steps):
+        def sleep(seconds):
             if not steps:
                 raise KeyboardInterrupt
             steps.pop(0)()
 
-        monkeypatch.setattr(watch.time, "sleep", sleep)
+        monkeypatch.setattr("time.sleep", sleep)
 
     # Meanwhile, the folder is away for two looks.
     steps = [lambda: parts.rename("away"), lambda: None, lambda: Path("away").rename(parts)]
@@ -269,7 +267,7 @@ def test_captures_are_computed_as_they_arrive_and_only_once(
     assert Path("out/-first 1/report.json").stat().st_mtime_ns == before
 
 
-def test_an_interruption_of_a_capture_ends_it(run, capture, monkeypatch) -> None:
+def test_an_interruption_of_a_capture_ends_it(run, capture, monkeypatch):
     Path("parts").mkdir()
     capture.rename("parts/sphere")
     monkeypatch.setattr("splinecli.pipeline.batch.run_member", Mock(side_effect=KeyboardInterrupt))
@@ -289,11 +287,11 @@ def test_an_interruption_of_a_capture_ends_it(run, capture, monkeypatch) -> None
         (("--overwrite", "--update"), "contradict each other"),
     ],
 )
-def test_wrong_options_are_refused(run, capture, options: tuple[str, ...], problem: str) -> None:
+def test_wrong_options_are_refused(run, capture, options, problem):
     result = run("watch", capture, "--settle", 0, "--", *options)
     assert result.code == 2 and problem in result.err
 
 
-def test_no_folder(run, capture) -> None:
+def test_no_folder(run, capture):
     result = run("watch", "nowhere")
     assert result.code == 3 and "nowhere: the folder cannot be read" in result.err

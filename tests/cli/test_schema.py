@@ -9,12 +9,11 @@ from typing import Any
 import jsonschema
 import pytest
 
+from scenes import read_json
 from splinecli.records.capture_warnings import WARNINGS
 from splinecli.records.documents import json_schema
 
-SCHEMA = json.loads(
-    (Path(__file__).resolve().parents[2] / "docs/reports.schema.json").read_text("utf-8")
-)
+SCHEMA = read_json(Path(__file__).resolve().parents[2] / "docs/reports.schema.json")
 
 
 def check(document: Any, name: str) -> None:
@@ -34,7 +33,7 @@ def check(document: Any, name: str) -> None:
 )
 def test_reports_of_infer(capture, run, arguments):
     [printed] = json.loads(run("infer", capture, *arguments, "--json").out)
-    written = json.loads(Path("out/sphere/report.json").read_text("utf-8"))
+    written = read_json("out/sphere/report.json")
     assert printed == written
     check(written, "Report")
     assert (written["surface"] is None) == ("--surface" not in arguments)
@@ -56,7 +55,7 @@ def test_results_of_evaluate(make_capture, run, lights):
     chosen = [word for number in lights for word in ("--n-lights", number)]
     arguments = ("--method", "ls", "--method", "l1", *chosen, "--trials", 2)
     document = json.loads(run("evaluate", "data", *arguments, "--json").out)
-    assert document == json.loads(Path("evaluation/results.json").read_text("utf-8"))
+    assert document == read_json("evaluation/results.json")
     check(document, "Results")
     for change in ({"colour": 1}, {"averages": {"ls": "good"}}):
         with pytest.raises(jsonschema.ValidationError):
@@ -64,7 +63,7 @@ def test_results_of_evaluate(make_capture, run, lights):
 
 
 def test_the_published_schema_is_that_of_the_documents():
-    """Made by `python man/make_pages.py`."""
+    """Made by `python docs/generate.py`."""
     assert json_schema() == SCHEMA
 
 

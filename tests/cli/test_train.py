@@ -1,7 +1,6 @@
 """`splinecli train`: a short run, its files, continuation, and refusals."""
 
 import csv
-import json
 import os
 import sys
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from scenes import read_json
 from small_pixel_sets import matte_pixels
 from splinecli.system.files import UNFINISHED
 from splinecli.system.publishing import UNDONE
@@ -39,7 +39,7 @@ SAVED = {"weights.safetensors", "checkpoint.safetensors", "config.json", "metric
 
 
 def settings() -> dict[str, Any]:
-    return json.loads(Path("run/config.json").read_text())
+    return read_json("run/config.json")
 
 
 def write_set(folder: str, *, finished: bool = True) -> None:
@@ -126,7 +126,7 @@ def test_settings_come_from_preset_file_and_options(run, no_pictures):
     assert (
         run("train", "-o", "other", "--config", "run/config.json", "--seed", 9, "--quiet").code == 0
     )
-    assert json.loads(Path("other/config.json").read_text()) == values | {"seed": 9}
+    assert read_json("other/config.json") == values | {"seed": 9}
 
 
 def test_tensorboard_is_an_extra(run, no_pictures, monkeypatch):

@@ -8,9 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from cli.conftest import EXAMPLE, read_report
-from scenes import BUMP_LAMPS, write_bump
+from scenes import BUMP_LAMPS, read_image, to_uint16, write_bump, write_image
 
 
 def write_lights(folder: Path, change) -> None:
@@ -58,13 +59,13 @@ def test_an_order_is_named_although_the_intensities_are_unequal_and_unknown(
     (medallion / "light_intensities.txt").unlink()
     for number in (3, 7, 8):
         path = str(medallion / f"{number:02}.png")
-        cv2.imwrite(path, np.rint(0.6 * cv2.imread(path, cv2.IMREAD_UNCHANGED)).astype(np.uint16))
+        cv2.imwrite(path, to_uint16(0.6 * cv2.imread(path, cv2.IMREAD_UNCHANGED)))
     for command in (("info", medallion), ("infer", medallion, "--method", "ls")):
         assert "light" not in run(*command, *options).err.replace(
             "The light intensities were estimated", ""
         )
     write_lights(medallion, lambda lights: lights[[0, 5, 2, 3, 4, 1, 6, 7, 8, 9]])
-    for command in (("info", medallion), ("infer", medallion, "--method", "ls", "--overwrite")):
+    for command in (("info", medallion), ("infer", medallion, "--method", "ls", "--overwrite")):  # type: ignore[assignment]
         found = run(*command, *options).err
         assert "much better with the lights of 02.png and 06.png exchanged (misfit" in found
 
@@ -101,7 +102,7 @@ def test_mended_lights(run, medallion):
     report = json.loads(run("info", medallion, "--mended-lights", "mended.txt", "--json").out)
     assert report["mended_lights"] == "mended.txt"
     right /= np.linalg.norm(right, axis=1, keepdims=True)
-    np.testing.assert_allclose(np.loadtxt("mended.txt"), right, atol=1e-6)
+    assert_allclose(np.loadtxt("mended.txt"), right, atol=1e-6)
     assert run("info", medallion, "--mended-lights", "mended.txt").code == 5
     assert run("infer", medallion, "--lights", "mended.txt", "--method", "ls", "--strict").code == 0
     for name in ("mended.lp", "mended.npy"):
@@ -110,7 +111,7 @@ def test_mended_lights(run, medallion):
             "infer", medallion, "--lights", name, "--method", "ls", "--strict", "-o", name[-3:]
         )
         assert (again.code, again.err) == (0, "")
-        np.testing.assert_allclose(
+        assert_allclose(
             read_report(Path(name[-3:], "medallion"))["light_directions"], right, atol=1e-5
         )
     for suffix in ("json", "mat", "yml", "xml"):
@@ -136,7 +137,7 @@ def test_what_cannot_be_checked_is_said_and_no_error(run, medallion):
     )
     mask = np.zeros((128, 128), np.uint8)
     mask[40:90, 40:90] = 255
-    cv2.imwrite(str(medallion / "mask.png"), mask)
+    write_image(medallion / "mask.png", mask)
     write_lights(medallion, lambda lights: lights * (-1, -1, 1))
     relief = run("info", medallion, "--strict")
     assert relief.code == 0
@@ -175,8 +176,8 @@ def test_a_file_of_all_intensities_fits_a_light_file_that_names_some_images(run,
 
 
 def test_an_image_that_contradicts_the_others_is_named(run, medallion):
-    picture = cv2.imread(str(medallion / "07.png"), cv2.IMREAD_UNCHANGED)
-    cv2.imwrite(str(medallion / "07.png"), (picture * 0.4).astype(picture.dtype))
+    picture = read_image(medallion / "07.png")
+    write_image(medallion / "07.png", (picture * 0.4).astype(picture.dtype))
     result = run("info", medallion, "--strict", "--json")
     assert result.code == 3
     report = json.loads(result.out)
@@ -201,10 +202,10 @@ def rough() -> np.ndarray:
     return rough / np.linalg.norm(rough, axis=1, keepdims=True)
 
 
-def test_infer(document, rough: np.ndarray) -> None:
+def test_infer(document, rough):
     command = ("infer", "bump", "--method", "ls", "--overwrite")
     given, refined = (document(*command, *more) for more in ((), ("--refine-lights",)))
-    np.testing.assert_allclose(given["light_directions"], rough, atol=1e-5)
+    assert_allclose(given["light_directions"], rough, atol=1e-5)
     moved = np.degrees(
         np.arccos((np.array(refined["light_directions"]) * rough).sum(axis=1).clip(-1, 1))
     )
@@ -214,7 +215,7 @@ def test_infer(document, rough: np.ndarray) -> None:
     assert refined["angular_error_deg"]["mean"] < 0.9 * given["angular_error_deg"]["mean"]
 
 
-def test_evaluate(document, rough: np.ndarray) -> None:
+def test_evaluate(document, rough):
     """Both protocols share a folder: trials with refined lights are other trials."""
     command = ("evaluate", "bump", "--method", "ls", "--n-lights", "all", "-o", "scores")
     options = ((), ("--refine-lights",), ("--refine-lights", "--light-error-deg", "3"))
@@ -225,7 +226,7 @@ def test_evaluate(document, rough: np.ndarray) -> None:
     assert errors[2] not in errors[:2]
 
 
-def test_evaluate_skips_a_capture_with_near_lamps(run, rough: np.ndarray) -> None:
+def test_evaluate_skips_a_capture_with_near_lamps(run, rough):
     write_bump(Path("near"))
     np.savetxt("near/light_positions.txt", BUMP_LAMPS)
     Path("near/pixel_size.txt").write_text("2\n")
@@ -238,7 +239,7 @@ def test_evaluate_skips_a_capture_with_near_lamps(run, rough: np.ndarray) -> Non
     assert run("evaluate", "near", *arguments).code == 2
 
 
-def test_a_light_error_without_refined_lights_is_refused(run, rough: np.ndarray) -> None:
+def test_a_light_error_without_refined_lights_is_refused(run, rough):
     result = run("evaluate", "bump", "--method", "ls", "--light-error-deg", "4")
     assert (result.code, "--light-error-deg needs --refine-lights" in result.err) == (2, True)
 
@@ -246,9 +247,9 @@ def test_a_light_error_without_refined_lights_is_refused(run, rough: np.ndarray)
 def test_a_black_patch_amid_the_object(run, medallion):
     """The check of the lights integrates its surface, also where no light reaches a pixel."""
     for path in medallion.glob("[01]*.png"):
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        image = read_image(path)
         image[54:74, 54:74] = 0
-        cv2.imwrite(str(path), image)
+        write_image(path, image)
     result = run("infer", medallion, "--method", "ls")
     assert result.code == 0
     assert "black_pixels" in [

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from scenes import directions_at
@@ -72,7 +73,7 @@ def features(capture: Capture) -> CaptureFeatures:
     return found[0]
 
 
-def test_each_fault_shows_in_its_own_feature() -> None:
+def test_each_fault_shows_in_its_own_feature():
     lights = draw_lights()
     right, near, bent = (
         features(capture)
@@ -93,22 +94,22 @@ def test_each_fault_shows_in_its_own_feature() -> None:
     assert dimmed.free_light_misfit < dimmed.light_misfit - 1.5
 
 
-def test_the_order_of_lights_and_the_exposure_do_not_count() -> None:
+def test_the_order_of_lights_and_the_exposure_do_not_count():
     capture = relief(draw_lights(), widths=4)
     order = np.random.default_rng(3).permutation(capture.n_lights)
     other = capture.choose_lights(order.tolist())
     other = replace(other, observations=other.observations * np.float32(37))
-    np.testing.assert_allclose(features(other), features(capture), atol=1e-4)
+    assert_allclose(features(other), features(capture), atol=1e-4)
 
 
-def test_an_untrained_head_changes_little() -> None:
+def test_an_untrained_head_changes_little():
     errors = torch.tensor([[-2.0, 1.0], [0.0, 0.5]])
     capture = torch.full((CAPTURE_FEATURES,), torch.nan)
     turn = CaptureFeatures._fields.index("bend_turn")
     capture[turn] = np.log(2.0)
     found = CaptureHead()(errors, torch.zeros(2, PIXEL_FEATURES), capture)
     added = np.exp(-3.5) + np.radians(0.6 * 2.0)
-    np.testing.assert_allclose(found[:, 0].exp().detach(), errors[:, 0].exp() + added, rtol=1e-5)
+    assert_allclose(found[:, 0].exp().detach(), errors[:, 0].exp() + added, rtol=1e-5)
     np.testing.assert_array_equal(found[:, 1].detach(), errors[:, 1])
 
 
@@ -118,7 +119,7 @@ def claim(capture: Capture) -> tuple[NormalEstimate, float, float]:
     return estimate, estimate.expected_under_5, estimate.errors.under_5
 
 
-def test_the_claim_falls_with_the_truth() -> None:
+def test_the_claim_falls_with_the_truth():
     """Nine of ten pixels were claimed to be right under near lamps that counted as distant."""
     lights = draw_lights()
     estimate, right, truly = claim(relief(lights))
@@ -133,7 +134,7 @@ def test_the_claim_falls_with_the_truth() -> None:
     assert bent < 0.8
 
 
-def test_what_cannot_be_judged() -> None:
+def test_what_cannot_be_judged():
     capture = relief(draw_lights())
     for part in (capture.choose_lights((0, 2, 5, 9)), capture.choose_pixels(np.arange(30))):
         assert not claim(part)[0].capture_judged
@@ -141,13 +142,13 @@ def test_what_cannot_be_judged() -> None:
     assert capture_head(manifest()["cnn-ps"]["sha256"]) is None
 
 
-def test_a_capture_one_pixel_high() -> None:
+def test_a_capture_one_pixel_high():
     capture = relief(draw_lights())
     flat = replace(capture, mask=capture.mask.reshape(1, -1), ground_truth=None)
     assert estimate_normals(flat, make_estimator("spline-net-pixelwise")).capture_judged
 
 
-def test_dark_pixels_stay_unknown() -> None:
+def test_dark_pixels_stay_unknown():
     capture = relief(draw_lights())
     values = capture.observations.copy()
     values[:200] = 0

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
+from scenes import Floats
 from splinecli.capture import Capture
 from splinecli.estimate.inference import estimate_normals, estimate_pixels
 from splinecli.estimate.methods.estimator import TILE_PIXELS, LeastSquares
@@ -12,7 +14,7 @@ from splinecli.lights.lighting import PixelLighting
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
 
 
-def bowl(height: int = 13, width: int = 11) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def bowl(height: int = 13, width: int = 11) -> tuple[Floats, NDArray[np.bool_]]:
     """Normals (H, W, 3) that all lights reach, and a mask with holes."""
     y, x = np.mgrid[1 : -1 : height * 1j, -1 : 1 : width * 1j]
     normals = np.stack((0.2 * x, 0.2 * y, np.ones_like(x)), axis=-1)
@@ -21,31 +23,31 @@ def bowl(height: int = 13, width: int = 11) -> tuple[NDArray[np.float64], NDArra
     return normals / np.linalg.norm(normals, axis=-1, keepdims=True), mask
 
 
-def capture(ground_truth: NDArray[np.float64] | None = None) -> Capture:
+def capture(ground_truth: Floats | None = None) -> Capture:
     normals, mask = bowl()
     return Capture("bowl", 0.7 * normals[mask] @ LIGHTS.T, LIGHTS, (0, 1, 2, 3), mask, ground_truth)
 
 
-def test_normals_stand_where_their_pixels_are() -> None:
+def test_normals_stand_where_their_pixels_are():
     normals, mask = bowl()
     estimate = estimate_normals(capture(), LeastSquares())
     assert estimate.normal_map.dtype == np.float32
     # The observations were rounded to float32.
-    np.testing.assert_allclose(estimate.normal_map[mask], normals[mask], atol=1e-6)
+    assert_allclose(estimate.normal_map[mask], normals[mask], atol=1e-6)
     assert not estimate.normal_map[~mask].any()
     assert estimate.error_map_deg is None
     assert estimate.errors is None
 
 
 @pytest.mark.parametrize("tile_pixels", [1, 7, 10_000])
-def test_tiles_change_nothing_but_the_progress(tile_pixels: int) -> None:
+def test_tiles_change_nothing_but_the_progress(tile_pixels):
     whole = estimate_normals(capture(), LeastSquares())
     done: list[int] = []
     estimator = LeastSquares()
     estimator.tile_pixels = tile_pixels
     tiled = estimate_normals(capture(), estimator, progress=done.append)
     # Matrix products of other heights may add up in another order.
-    np.testing.assert_allclose(tiled.normal_map, whole.normal_map, atol=1e-6)
+    assert_allclose(tiled.normal_map, whole.normal_map, atol=1e-6)
     n_pixels = capture().n_pixels
     assert sum(done) == n_pixels
     assert len(done) == -(-n_pixels // tile_pixels)
@@ -55,9 +57,7 @@ def test_tiles_change_nothing_but_the_progress(tile_pixels: int) -> None:
 @pytest.mark.parametrize(
     ("near", "n_lights", "most"), [(False, 10, 1 << 19), (True, 10, 1 << 18), (True, 40, 1 << 16)]
 )
-def test_an_estimator_gets_fewer_pixels_at_once_if_each_has_many_numbers(
-    near, n_lights, most
-) -> None:
+def test_an_estimator_gets_fewer_pixels_at_once_if_each_has_many_numbers(near, n_lights, most):
     """Under near lamps, every pixel has its own directions, which would take gigabytes."""
     asked = []
 

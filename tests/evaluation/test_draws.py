@@ -35,7 +35,7 @@ def random_lights(n_lights: int, seed: int = 0) -> np.ndarray:
 LIGHTS = random_lights(96)
 
 
-def test_draws_are_those_of_earlier_versions() -> None:
+def test_draws_are_those_of_earlier_versions():
     """Published numbers name a seed: the draws behind it stay."""
     assert draw_lights(LIGHTS, 10, trials=2, seed=0) == [
         (10, 25, 40, 41, 50, 61, 74, 76, 87, 90),
@@ -44,7 +44,7 @@ def test_draws_are_those_of_earlier_versions() -> None:
 
 
 @given(n_lights=st.integers(4, 95), seed=st.integers(0, 2**40))
-def test_a_draw_is_rising_distinct_indices(n_lights: int, seed: int) -> None:
+def test_a_draw_is_rising_distinct_indices(n_lights, seed):
     (draw,) = draw_lights(LIGHTS, n_lights, seed=seed)
     assert len(draw) == n_lights
     assert list(draw) == sorted(set(draw))
@@ -52,13 +52,13 @@ def test_a_draw_is_rising_distinct_indices(n_lights: int, seed: int) -> None:
     assert all(type(index) is int for index in draw)
 
 
-def test_more_trials_continue_the_list() -> None:
+def test_more_trials_continue_the_list():
     assert draw_lights(LIGHTS, 10, trials=30, seed=4)[:7] == draw_lights(
         LIGHTS, 10, trials=7, seed=4
     )
 
 
-def test_every_light_is_equally_likely() -> None:
+def test_every_light_is_equally_likely():
     trials, share = 2000, 10 / 96
     counts = np.bincount(np.ravel(draw_lights(LIGHTS, 10, trials=trials, seed=0)), minlength=96)
     # Each count is binomial; the largest of 96 deviations beyond 4.5 standard deviations has a
@@ -67,11 +67,11 @@ def test_every_light_is_equally_likely() -> None:
 
 
 @pytest.mark.parametrize("n_lights", [None, 96])
-def test_all_lights_are_one_draw(n_lights: int | None) -> None:
+def test_all_lights_are_one_draw(n_lights):
     assert draw_lights(LIGHTS, n_lights, trials=100, seed=3) == [tuple(range(96))]
 
 
-def test_lights_in_one_plane_are_drawn_again() -> None:
+def test_lights_in_one_plane_are_drawn_again():
     """Of five lights the first four lie in the plane y = 0: a draw of three needs the fifth."""
     flat = unit(np.array([[-0.5, 0, 1], [0.2, 0, 1], [0.5, 0, 1], [0.9, 0, 1], [0, 0.5, 1]]))
     draws = draw_lights(flat, 3, trials=100, seed=0)
@@ -83,7 +83,7 @@ def test_lights_in_one_plane_are_drawn_again() -> None:
 
 
 @pytest.mark.parametrize(("name", "value"), [("trials", 0), ("seed", -1)])
-def test_what_cannot_be_drawn(name: str, value: int) -> None:
+def test_what_cannot_be_drawn(name, value):
     with pytest.raises(UsageError, match=f"--{name} is {value}; expected"):
         draw_lights(LIGHTS, n_lights=10, **{name: value})
 
@@ -94,7 +94,7 @@ def write(tmp_path: Path, text: str) -> Path:
     return path
 
 
-def test_a_draws_file(tmp_path: Path) -> None:
+def test_a_draws_file(tmp_path):
     file = read_draws(write(tmp_path, "# ours\n0 3 5\n\n 95,1,  2  # in any order\n7\t8;9"))
     assert (file.draws, file.lines, file.n_lights) == (
         ((0, 3, 5), (95, 1, 2), (7, 8, 9)),
@@ -117,7 +117,7 @@ def test_a_draws_file(tmp_path: Path) -> None:
         ("# nothing\n", ": the file contains no draws, expected a line of light indices for each."),
     ],
 )
-def test_a_wrong_draws_file(tmp_path: Path, text: str, problem: str) -> None:
+def test_a_wrong_draws_file(tmp_path, text, problem):
     path = write(tmp_path, text)
     with pytest.raises(InputError) as raised:
         read_draws(path)
@@ -157,7 +157,7 @@ def mae_deg(folder: Path, lights: tuple[int, ...], **settings: bool) -> float:
     ).errors.mean
 
 
-def test_each_trial_scores_what_infer_computes_from_its_lights(folder: Path) -> None:
+def test_each_trial_scores_what_infer_computes_from_its_lights(folder):
     draws = draw_lights(open_capture(folder).light_directions, 5, trials=12, seed=1)
     levels = {draw: prepare_capture(open_capture(folder), draw).white_level for draw in draws}
     assert set(levels.values()) == {WhiteLevel(LEVEL, "images"), WhiteLevel(65_535, "full scale")}
@@ -167,8 +167,8 @@ def test_each_trial_scores_what_infer_computes_from_its_lights(folder: Path) -> 
 
 
 @pytest.mark.parametrize("max_pixels", [None, 200])
-def test_the_number_of_trials_does_not_change_a_trial(folder: Path, max_pixels: int | None) -> None:
-    def maes_deg(trials: int, store: TrialStore) -> tuple[float, ...]:
+def test_the_number_of_trials_does_not_change_a_trial(folder, max_pixels):
+    def maes_deg(trials, store):
         protocol = Protocol(5, trials=trials, seed=1, max_pixels=max_pixels)
         ((result,),) = (e.results for e in evaluate_all([folder], [LS], [protocol], store=store))
         return result.maes_deg
@@ -182,7 +182,7 @@ def observed(folder: Path, lights: Sequence[int] | None = None) -> Work:
     return follow(begin(open_capture(folder), lights), last="observations")
 
 
-def test_a_part_of_the_images_and_pixels_keeps_the_level_of_its_images(folder: Path) -> None:
+def test_a_part_of_the_images_and_pixels_keeps_the_level_of_its_images(folder):
     stored = observed(folder)
     assert stored.made.white_level == WhiteLevel(LEVEL, "images")
     dim = stored.choose_images([1, 4, 5, 6, 8])

@@ -50,14 +50,12 @@ def share_of(colour: str, picture: NDArray[np.uint8]) -> float:
         (list("abcde"), 1, 1),
     ],
 )
-def test_a_panel_for_each_capture_and_the_average(
-    captures: list[str], across: int, down: int
-) -> None:
+def test_a_panel_for_each_capture_and_the_average(captures, across, down):
     picture = decode_rgb(lights_curves([evaluation_of(captures, k) for k in (4, 10, None)]))
     assert picture.shape == (540 * down + 80, 640 * across, 3) and (picture[0] == 255).all()
 
 
-def test_each_method_has_its_colour_in_both_plots() -> None:
+def test_each_method_has_its_colour_in_both_plots():
     styles = method_styles(METHODS)
     for png in (
         lights_curves([evaluation_of(["ball"], k) for k in (4, 10, 32)]),
@@ -67,13 +65,13 @@ def test_each_method_has_its_colour_in_both_plots() -> None:
             assert share_of(styles[method].colour, decode_rgb(png)) > 0.002  # a line 3 pixels thick
 
 
-def test_captures_that_not_all_have_are_left_out() -> None:
+def test_captures_that_not_all_have_are_left_out():
     fewer = evaluation_of(["ball"], 50)
     both = evaluation_of(["ball", "cat"], 10)
     assert lights_curves([both, fewer]) == lights_curves([evaluation_of(["ball"], 10), fewer])
 
 
-def test_odd_names_one_point_and_one_trial_are_drawn() -> None:
+def test_odd_names_one_point_and_one_trial_are_drawn():
     odd = Evaluation(Protocol(10), (Result("_m$x$", "a$b_{c$ 猫", 10, (3.0,), 1.0),))
     # matplotlib takes what stands between dollars for a formula, and raises for this one.
     for draw in (lights_curves, light_noise_curves):

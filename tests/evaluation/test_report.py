@@ -39,7 +39,7 @@ def evaluation_of(
     )
 
 
-def test_one_evaluation() -> None:
+def test_one_evaluation():
     page = HtmlPage(
         html_report(
             [evaluation_of(["ls", "iw12"], ["ball", "cat"])], [("A plot", PNG)], ["Ball is round."]
@@ -71,7 +71,7 @@ def test_one_evaluation() -> None:
     assert len(best) == 3  # the first method on both captures and the average
 
 
-def test_several_evaluations_begin_with_their_averages() -> None:
+def test_several_evaluations_begin_with_their_averages():
     evaluations = [evaluation_of(["ls", "iw12"], ["ball"], n_lights=k) for k in (4, 10)]
     evaluations.append(evaluation_of(["ls", "iw12"], ["ball"], trials=1, n_lights=None))
     page = HtmlPage(html_report(evaluations, [], []))
@@ -87,7 +87,7 @@ def test_several_evaluations_begin_with_their_averages() -> None:
     assert page.text["li"].count(": bear: no images.") == 1
 
 
-def test_many_methods_have_a_matrix() -> None:
+def test_many_methods_have_a_matrix():
     methods = [f"m{i}" for i in range(5)]
     page = HtmlPage(html_report([evaluation_of(methods, ["ball"])], [], []))
     assert any(words.startswith("Average MAE of the row’s method") for words in page.text["span"])
@@ -96,7 +96,7 @@ def test_many_methods_have_a_matrix() -> None:
     assert sum("−1." in words or "−0.9" in words for words in page.text["td"]) >= 4
 
 
-def test_it_stands_alone() -> None:
+def test_it_stands_alone():
     html = html_report([evaluation_of(["ls", "iw12"], ["ball"])], [("A", PNG), ("B", WIDE_PNG)], [])
     page = HtmlPage(html)
     assert not all_of(page, "script") + all_of(page, "link")
@@ -110,7 +110,7 @@ def test_it_stands_alone() -> None:
 
 
 @pytest.mark.parametrize("name", ["<b>&", '"><script>alert(1)</script>', "{{ 7 * 7 }}", "a'b"])
-def test_names_are_text(name: str) -> None:
+def test_names_are_text(name):
     evaluation = replace(
         evaluation_of([name, "ls"], [name + "1", "ball"]),
         skipped=(SkippedCapture(capture=name, reason=name),),
@@ -121,7 +121,7 @@ def test_names_are_text(name: str) -> None:
     assert not all_of(page, "b") + all_of(page, "script")
 
 
-def test_it_can_be_read_by_all() -> None:
+def test_it_can_be_read_by_all():
     html = html_report([evaluation_of(["ls", "iw12"], ["ball"])], [("A", PNG)], [])
     page = HtmlPage(html)
     assert all_of(page, "html") == [{"lang": "en"}]

@@ -7,7 +7,6 @@ hand.
 import csv
 import json
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,7 +50,7 @@ ALL = Evaluation(
 )
 
 
-def test_whole_documents(golden: Callable[[str, str], None]) -> None:
+def test_whole_documents(golden):
     """Of the comparisons by hand: differences 0.75 and 1.75, t = 1.25 / 0.5 = 2.5 with one degree
     of freedom, where t's distribution is Cauchy's: p = 1 - 2 atan(2.5) / pi = 0.242, and 0.5
     tan(0.95 pi / 2) = 6.3531."""
@@ -65,7 +64,7 @@ def test_whole_documents(golden: Callable[[str, str], None]) -> None:
         golden(f"evaluation_results.{suffix}", text)
 
 
-def test_rows_for_a_terminal() -> None:
+def test_rows_for_a_terminal():
     rows = table_rows(TEN)
     assert rows == [
         ["method", "ball", "cat", "average"],
@@ -82,12 +81,12 @@ def test_rows_for_a_terminal() -> None:
         ("![a](javascript:alert(1)) &lt; ~~b~~", r"!\[a\](javascript:alert(1)) \&lt; \~\~b\~\~"),
     ],
 )
-def test_names_are_text_in_markdown(name: str, shown: str) -> None:
+def test_names_are_text_in_markdown(name, shown):
     odd = replace(TEN, results=(replace(TEN.results[0], capture=name),))
     assert markdown([odd]).startswith(f"| method | {shown} | average |\n")
 
 
-def test_light_noise_tells_evaluations_apart() -> None:
+def test_light_noise_tells_evaluations_apart():
     noisy = replace(TEN, protocol=replace(TEN.protocol, light_noise_deg=2.5))
     document = results_document([TEN, noisy])
     assert document["protocol"]["n_lights"] == 10
@@ -102,7 +101,7 @@ def test_light_noise_tells_evaluations_apart() -> None:
 
 
 @pytest.mark.parametrize("as_stored", [False, True])
-def test_every_document_names_how_the_captures_were_read(as_stored: bool) -> None:
+def test_every_document_names_how_the_captures_were_read(as_stored):
     evaluation = replace(TEN, protocol=replace(TEN.protocol, as_stored=as_stored))
     words = "images as stored." if as_stored else "images restored."
     assert words in markdown([evaluation]) and words in latex([evaluation])
@@ -119,7 +118,7 @@ def test_every_document_names_how_the_captures_were_read(as_stored: bool) -> Non
     assert shown in html_report([evaluation], [], [])
 
 
-def test_latex_escapes_names() -> None:
+def test_latex_escapes_names():
     odd = replace(TEN.results[0], method=r"a_b&50%", capture=r"#1 $x$ {y} \z ~^ <|>")
     drawn = replace(TEN.protocol, draws_file=Path("my_draws.txt"))
     text = latex([replace(TEN, protocol=drawn, results=(odd,))])
@@ -144,7 +143,7 @@ FIRST = (0.7, -1.6, -0.2, -1.2, -0.1, 3.4, 3.7, 0.8, 0.0, 2.0)
 SECOND = (1.9, 0.8, 1.1, 0.1, -0.1, 4.4, 5.5, 1.6, 4.6, 3.4)
 
 
-def test_students_example() -> None:
+def test_students_example():
     comparison, average = compare(evaluation_of(ball={"ls": FIRST, "iw12": SECOND}))
     # As R's t.test(extra ~ group, paired = TRUE) prints it.
     assert comparison.p_value == pytest.approx(0.002833, abs=5e-7)
@@ -159,14 +158,14 @@ def test_students_example() -> None:
     assert average.p_value == pytest.approx(comparison.p_value)
 
 
-def test_holm_by_hand() -> None:
+def test_holm_by_hand():
     # m = 4: 0.01 * 4; 0.03 * 3 = 0.09; 0.04 * 2 = 0.08, held up by 0.09; 0.9 * 1.
     assert holm([0.04, 0.01, 0.9, 0.03]) == pytest.approx([0.09, 0.04, 0.9, 0.09])
     assert holm([0.6, 0.7]) == [1.0, 1.0]
     assert holm([]) == []
 
 
-def test_every_pair_on_every_capture_and_on_their_average() -> None:
+def test_every_pair_on_every_capture_and_on_their_average():
     generator = np.random.default_rng(1)
     draws = {
         capture: {
@@ -211,7 +210,7 @@ def test_where_there_is_nothing_to_test(first, second, interval, p_value, differ
         assert np.isfinite([comparison.difference_deg, comparison.std_deg]).all()
 
 
-def test_pairs_without_a_test_do_not_count_in_the_correction() -> None:
+def test_pairs_without_a_test_do_not_count_in_the_correction():
     shifted = tuple(value + 1 for value in FIRST)
     comparisons = compare(evaluation_of(ball={"a": FIRST, "b": SECOND, "c": shifted}))
     on_ball = {(c.first, c.second): c for c in comparisons if c.capture == "ball"}
@@ -222,6 +221,6 @@ def test_pairs_without_a_test_do_not_count_in_the_correction() -> None:
     )
 
 
-def test_the_average_takes_the_trials_all_captures_have() -> None:
+def test_the_average_takes_the_trials_all_captures_have():
     uneven = evaluation_of(ball={"a": (1.0, 2.0, 9.0)}, cat={"a": (3.0, 5.0)})
     assert trial_averages(uneven, "a") == (2.0, 3.5)

@@ -8,12 +8,11 @@ import sys
 import time
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from kills import content
-from scenes import write_capture
+from scenes import write_capture, write_image
 from splinecli.errors import InputError
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.maths.normals import unit
@@ -45,7 +44,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_kills_of_every_command() -> None:
+def test_kills_of_every_command():
     script = [
         sys.executable,
         str(Path(__file__).with_name("kill_commands.py")),
@@ -62,15 +61,14 @@ def test_kills_of_every_command() -> None:
 
 
 @pytest.mark.parametrize("disk_kb", [16, 64])
-def test_a_full_disk_leaves_what_was_there(folder: Path, disk_kb: int) -> None:
+def test_a_full_disk_leaves_what_was_there(folder, disk_kb):
     """The disk has room for no results; or for one set, and is filled after it."""
     mount = f"mount -t tmpfs -o size={disk_kb}k tiny disk"
     infer = f"{COMMAND} infer a --method ls -o disk --overwrite --format npy -q"
     fill = f"{infer} && cp -r disk before && cat /dev/zero >disk/fill 2>/dev/null;"
     script = (
-        f"mkdir disk; {mount} || exit 77; cp a/light_directions.txt disk/kept;"
-        f" {fill if disk_kb == 64 else ''}"
-        f" {infer}; echo $? >code; rm -f disk/fill; cp -r disk left"
+        f"mkdir disk; {mount} || exit 77; cp a/light_directions.txt disk/kept; "
+        f"{fill if disk_kb == 64 else ''} {infer}; echo $? >code; rm -f disk/fill; cp -r disk left"
     )
     done = shell(f"unshare --map-root-user --mount bash -c '{script}'", folder)
     if done.returncode or not (folder / "code").exists():
@@ -93,14 +91,14 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("large")
     lights = np.tile(LIGHTS, (4, 1))
     noise = np.random.default_rng(0).integers(0, 20_000, (1000, 1200), np.uint16)
-    cv2.imwrite(str(folder / "00.png"), noise)
+    write_image(folder / "00.png", noise)
     for number in range(1, len(lights)):
         os.link(folder / "00.png", folder / f"{number:02d}.png")
     np.savetxt(folder / "lights.txt", lights)
     return folder
 
 
-def test_ctrl_c_while_a_large_capture_is_read(large: Path, tmp_path: Path) -> None:
+def test_ctrl_c_while_a_large_capture_is_read(large, tmp_path):
     """One thread decodes an image while another uses the one before: both end,
     and nothing is left.
     """
@@ -125,7 +123,7 @@ def test_ctrl_c_while_a_large_capture_is_read(large: Path, tmp_path: Path) -> No
     assert content(tmp_path) == {}
 
 
-def test_too_little_memory_for_the_results(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_memory_for_the_results(folder, monkeypatch):
     """The images fit, the albedo does not. This is said before the normals are estimated."""
     before = content(folder / "out")
     monkeypatch.setattr(
@@ -143,7 +141,7 @@ def test_too_little_memory_for_the_results(folder: Path, monkeypatch: pytest.Mon
     assert content(folder / "out") == before
 
 
-def test_a_limit_on_the_size_of_files_keeps_earlier_results(folder: Path) -> None:
+def test_a_limit_on_the_size_of_files_keeps_earlier_results(folder):
     before = content(folder / "out")
     done = shell(f"ulimit -f 4; trap '' XFSZ; {COMMAND} infer a --method ls --overwrite -q", folder)
     assert (done.returncode, done.stderr.count("\n")) == (5, 1)
@@ -165,7 +163,7 @@ print(json.dumps(codes))
 """
 
 
-def test_a_limit_on_open_files(folder: Path) -> None:
+def test_a_limit_on_open_files(folder):
     """The command is refused with one message as long as the limit is too low, and the next start
     finds results.
     """
@@ -188,12 +186,12 @@ def test_a_limit_on_open_files(folder: Path) -> None:
 
 
 BUSY = (
-    "splinecli: out/a: another splinecli process is writing into this folder."
-    " Wait for it to end, or choose another -o.\n"
+    "splinecli: out/a: another splinecli process is writing into this folder. Wait for it to end, "
+    "or choose another -o.\n"
 )
 
 
-def test_a_second_writer_is_refused(folder: Path) -> None:
+def test_a_second_writer_is_refused(folder):
     before = content(folder / "out")
     with held_folder(folder / "out" / "a"):
         done = shell(f"{COMMAND} infer a --method ls --overwrite -q", folder)
@@ -201,7 +199,7 @@ def test_a_second_writer_is_refused(folder: Path) -> None:
     assert content(folder / "out") == before
 
 
-def test_two_writers_of_one_folder(folder: Path) -> None:
+def test_two_writers_of_one_folder(folder):
     """One may be refused; what is left is whole."""
     infer = [*COMMAND.split(), "infer", "a", "--method", "ls", "--overwrite", "-q", "--format"]
     commands = [
@@ -218,7 +216,7 @@ def test_two_writers_of_one_folder(folder: Path) -> None:
     )
 
 
-def test_an_output_folder_without_permission(folder: Path) -> None:
+def test_an_output_folder_without_permission(folder):
     """As an ordinary user, also where the tests run as root."""
     (folder / "closed").mkdir(mode=0o555)
     rights = "-dac_override,-dac_read_search"

@@ -13,6 +13,8 @@ import trimesh
 from PIL import Image, ImageCms
 from scipy.io import savemat
 
+from scenes import write_image
+
 SHAPE = (16, 18)
 LIGHTS = np.array(
     [(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1), (0.4, 0.4, 1)], float
@@ -51,27 +53,27 @@ def png_capture(folder: Path) -> None:
     """DiLiGenT's layout, with every optional file."""
     names = [f"{number:03}.png" for number in range(len(LIGHTS))]
     for name, light in zip(names, LIGHTS, strict=True):
-        cv2.imwrite(str(folder / name), shaded(light))
+        write_image(folder / name, shaded(light))
     (folder / "filenames.txt").write_text("\n".join(names) + "\n")
     np.savetxt(folder / "light_directions.txt", LIGHTS)
     np.savetxt(folder / "light_intensities.txt", np.ones((len(LIGHTS), 3)))
     cv2.imwrite(
         str(folder / "mask.png"), (np.indices(SHAPE).sum(axis=0) > 3).astype(np.uint8) * 255
     )
-    cv2.imwrite(str(folder / "ambient.png"), np.full(SHAPE, 20, np.uint16))
+    write_image(folder / "ambient.png", np.full(SHAPE, 20, np.uint16))
     savemat(folder / "Normal_gt.mat", {"Normal_gt": normals()}, do_compression=True)
 
 
 def jpeg_capture(folder: Path) -> None:
     for number, light in enumerate(LIGHTS):
         gray = (shaded(light) // 257).astype(np.uint8)
-        cv2.imwrite(str(folder / f"{number}.jpg"), np.dstack([gray] * 3))
+        write_image(folder / f"{number}.jpg", np.dstack([gray] * 3))
     lines = [f"C:\\rti\\{n}.jpg {x} {y} {z}" for n, (x, y, z) in enumerate(LIGHTS)]
     (folder / "rti.lp").write_text("\n".join([str(len(LIGHTS)), *lines]))
     alpha = np.dstack(
         [np.full(SHAPE, 200, np.uint8)] * 3 + [np.tri(*SHAPE, k=8, dtype=np.uint8) * 255]
     )
-    cv2.imwrite(str(folder / "mask.png"), alpha)
+    write_image(folder / "mask.png", alpha)
     np.save(folder / "normal_gt.npy", normals().astype(np.float32))
 
 
@@ -82,7 +84,7 @@ def tiff_capture(folder: Path) -> None:
         if number == 3:
             tifffile.imwrite(folder / "3.tif", value.astype(np.float32) / 65_535)
         elif number == 4:
-            cv2.imwrite(str(folder / "4.tif"), value)  # LZW
+            write_image(folder / "4.tif", value)  # LZW
         else:
             rgb = np.dstack([value] * 3)
             tifffile.imwrite(
@@ -108,7 +110,7 @@ def pgm_and_stack_captures(folder: Path) -> None:
         (folder / name).mkdir()
         np.savetxt(folder / name / "lights.txt", LIGHTS)
     for number, light in enumerate(LIGHTS):
-        cv2.imwrite(str(folder / f"pgm/{number}.pgm"), shaded(light))
+        write_image(folder / f"pgm/{number}.pgm", shaded(light))
     pictures = np.stack([shaded(light) for light in LIGHTS])
     tifffile.imwrite(folder / "stack/stack.tif", pictures, photometric="minisblack")
 
@@ -116,7 +118,7 @@ def pgm_and_stack_captures(folder: Path) -> None:
 def light_files(folder: Path) -> None:
     """Light files of every form, and near lamps."""
     for number, light in enumerate(LIGHTS):
-        cv2.imwrite(str(folder / f"{number}.png"), shaded(light))
+        write_image(folder / f"{number}.png", shaded(light))
     azimuth = np.degrees(np.arctan2(LIGHTS[:, 1], LIGHTS[:, 0]))
     np.savetxt(
         folder / "azel.txt",
@@ -146,8 +148,8 @@ def normal_maps(folder: Path) -> None:
     np.save(folder / "n.npy", normals())
     savemat(folder / "n.mat", {"n": normals()})
     savemat(folder / "packed.mat", {"words": "text", "n": normals()}, do_compression=True)
-    cv2.imwrite(str(folder / "mask.png"), np.full(SHAPE, 255, np.uint8))
-    cv2.imwrite(str(folder / "colours.jpg"), np.full((*SHAPE, 3), 90, np.uint8))
+    write_image(folder / "mask.png", np.full(SHAPE, 255, np.uint8))
+    write_image(folder / "colours.jpg", np.full((*SHAPE, 3), 90, np.uint8))
     (folder / "camera.txt").write_text("500 0 9\n0 500 8\n0 0 1\n")
 
 
@@ -182,7 +184,7 @@ def mirror_ball(folder: Path) -> None:
                 str(folder / name / f"{number}.png"), np.rint(picture * 65_535).astype(np.uint16)
             )
     for name in ("ball", "gray"):
-        cv2.imwrite(str(folder / name / "mask.png"), inside.astype(np.uint8) * 255)
+        write_image(folder / name / "mask.png", inside.astype(np.uint8) * 255)
     np.savetxt(folder / "known.txt", LIGHTS[:4])
     (folder / "camera.txt").write_text("500 0 25\n0 500 20\n0 0 1\n")
 
@@ -193,7 +195,7 @@ def thin(folder: Path) -> None:
         (folder / name).mkdir()
         for number, light in enumerate(LIGHTS):
             picture = np.resize(shaded(light), shape)
-            cv2.imwrite(str(folder / name / f"{number}.png"), picture)
+            write_image(folder / name / f"{number}.png", picture)
         np.savetxt(folder / name / "light_directions.txt", LIGHTS)
 
 
@@ -287,10 +289,7 @@ TARGETS = (
         "pgm and stack",
         pgm_and_stack_captures,
         ("*/*.pgm", "*/*.tif"),
-        (
-            *each("infer {} --method ls -o out --overwrite", "pgm stack"),
-            "info stack",
-        ),
+        (*each("infer {} --method ls -o out --overwrite", "pgm stack"), "info stack"),
     ),
     Target(
         "lights",
@@ -302,9 +301,8 @@ TARGETS = (
                 "vectors.npy utf16.txt commas.txt named.csv list.json rig.dome",
             ),
             "infer . --method ls --lights azel.txt --light-format azel -o out --overwrite",
-            "infer . --method ls --light-positions positions.txt --pixel-size 1 --camera-matrix"
-            " camera.txt -o out"
-            " --overwrite",
+            "infer . --method ls --light-positions positions.txt --pixel-size 1 --camera-matrix "
+            "camera.txt -o out --overwrite",
         ),
     ),
     Target(
@@ -312,8 +310,8 @@ TARGETS = (
         normal_maps,
         ("*",),
         each(
-            "integrate {} --mask mask.png --colours colours.jpg --camera-matrix camera.txt -o out"
-            " --overwrite",
+            "integrate {} --mask mask.png --colours colours.jpg --camera-matrix camera.txt -o out "
+            "--overwrite",
             "n.png n.tif n.npy n.mat packed.mat",
         ),
     ),
@@ -322,10 +320,7 @@ TARGETS = (
         "meshes",
         meshes,
         ("m.*",),
-        each(
-            "prepare --mesh m.{0} --size 8 --n-lights 16 -o out/{0}",
-            "ply obj stl stl_ascii off",
-        ),
+        each("prepare --mesh m.{0} --size 8 --n-lights 16 -o out/{0}", "ply obj stl stl_ascii off"),
     ),
     Target(
         "ball",
@@ -374,8 +369,8 @@ TARGETS = (
             "infer second --method ls -o out --html --surface",
             "infer capture --method ls -o out --update",
             "integrate out/capture -o out/capture --overwrite",
-            "evaluate capture --method ls --n-lights 4 --n-lights 5 --trials 1 -o out/new"
-            " --figures --overwrite",
+            "evaluate capture --method ls --n-lights 4 --n-lights 5 --trials 1 -o out/new "
+            "--figures --overwrite",
             "prepare capture -o out/set",
         ),
         earlier=(
@@ -396,10 +391,7 @@ TARGETS = (
         "training",
         training,
         ("set/*", "set/*/*", "a.toml", "out/run/*.safetensors", "out/run/metrics.csv"),
-        (
-            f"{TRAIN} --resume --config a.toml",
-            "train set -o out/new -q --config a.toml --steps 1",
-        ),
+        (f"{TRAIN} --resume --config a.toml", "train set -o out/new -q --config a.toml --steps 1"),
         earlier=(f"{TRAIN} --config a.toml",),
     ),
 )

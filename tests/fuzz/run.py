@@ -84,7 +84,7 @@ class Worker:
         texts = [
             (self._folder / name).read_text("utf-8", "replace") for name in ("stdout", "stderr")
         ]
-        return Ended(code, *texts, seconds, memory)
+        return Ended(code, *texts, seconds, memory)  # type: ignore[call-arg]
 
     def end(self) -> None:
         """End the process."""
@@ -179,7 +179,7 @@ def prepare_process() -> None:
     torch.set_num_threads(1)
     typer.main.get_command = cache(typer.main.get_command)
     tasks.VALIDATION_PIXELS = 32
-    run_files.RunLog.draw = lambda *_: None
+    run_files.RunLog.draw = lambda *_: None  # type: ignore[method-assign]
     meshes.split_long_edges = partial(meshes.split_long_edges, most_faces=10)
 
 

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
-from scenes import shade, sphere_cap, spiral_lights, with_chunk, write_capture
+from scenes import Floats, shade, sphere_cap, spiral_lights, to_uint16, with_chunk, write_capture
 from splinecli.capture.formats.images import decode_image, to_linear
 from splinecli.capture.reader import CaptureOptions, open_capture
 from splinecli.errors import InputError
@@ -32,7 +33,7 @@ Images = NDArray[np.integer]
 FULL_SCALE = WhiteLevel(65_535, "full scale")
 
 
-def sphere(*, noise: float = 0.01) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def sphere(*, noise: float = 0.01) -> tuple[Floats, Floats]:
     """Images (F, H, W) of a matte sphere, which fills the picture, with a largest value of about 1;
     its normals.
     """
@@ -42,7 +43,7 @@ def sphere(*, noise: float = 0.01) -> tuple[NDArray[np.float64], NDArray[np.floa
     return images * rng.normal(1, noise, images.shape), normals
 
 
-def clip(images: NDArray[np.float64], level: int, exposure: float = 2.0) -> NDArray[np.uint16]:
+def clip(images: Floats, level: int, exposure: float = 2.0) -> NDArray[np.uint16]:
     return np.minimum(np.rint(images * exposure * level), level).astype(np.uint16)
 
 
@@ -61,12 +62,12 @@ def find(
 
 @pytest.mark.parametrize("level", [4095, 1023, 16_383, 4095 << 4, 15_600, 3839])
 @pytest.mark.parametrize("exposure", [1.1, 2.0, 4.0])
-def test_levels_below_full_scale_are_found(level: int, exposure: float) -> None:
+def test_levels_below_full_scale_are_found(level, exposure):
     images = clip(sphere()[0], level, exposure)
     assert find(images) == (WhiteLevel(level, "images"), np.count_nonzero(images == level))
 
 
-def test_the_file_s_full_scale_is_the_level_where_it_is_reached() -> None:
+def test_the_file_s_full_scale_is_the_level_where_it_is_reached():
     images = clip(sphere()[0], 65_535)
     assert find(images) == (FULL_SCALE, np.count_nonzero(images == 65_535))
     eight_bit = clip(sphere()[0], 255).astype(np.uint8)
@@ -109,7 +110,7 @@ def patches_of_a_cube() -> NDArray[np.uint16]:
 def normalised_to_12_bits() -> NDArray[np.uint16]:
     """Each image scaled so that its brightest pixel is 4095."""
     images = sphere(noise=0)[0]
-    return np.rint(images / images.max(axis=(1, 2), keepdims=True) * 4095).astype(np.uint16)
+    return to_uint16(images / images.max(axis=(1, 2), keepdims=True) * 4095)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +118,7 @@ def normalised_to_12_bits() -> NDArray[np.uint16]:
     [
         pytest.param(bright(4000), id="12 bits, not clipped"),
         pytest.param(bright(37), id="dark"),
-        pytest.param(np.rint(sphere(noise=0)[0] * 500).astype(np.uint16), id="dark, without noise"),
+        pytest.param(to_uint16(sphere(noise=0)[0] * 500), id="dark, without noise"),
         pytest.param(normalised_to_12_bits(), id="each normalised"),
         pytest.param(with_background(0), id="black background"),
         pytest.param(with_background(25_000), id="flat bright background"),
@@ -132,11 +133,11 @@ def normalised_to_12_bits() -> NDArray[np.uint16]:
         pytest.param(np.full((12, SIDE, SIDE), 4095, np.uint16), id="constant"),
     ],
 )
-def test_what_is_not_clipped_is_not_saturated(images: Images) -> None:
+def test_what_is_not_clipped_is_not_saturated(images):
     assert find(images) == (FULL_SCALE, 0)
 
 
-def test_one_clipped_image_is_not_enough() -> None:
+def test_one_clipped_image_is_not_enough():
     images = bright(3000)
     images[0] = clip(sphere()[0], 4095)[0]
     assert find(images)[1] == 0
@@ -145,7 +146,7 @@ def test_one_clipped_image_is_not_enough() -> None:
 
 
 @pytest.mark.parametrize("stored", [4095, 4095 << 4, 65_535])
-def test_levels_that_the_files_state(stored: int) -> None:
+def test_levels_that_the_files_state(stored):
     """A stated number of bits, whether or not the program shifted or scaled them to 16."""
     images = bright(100)
     images[3, 0, 0] = stored
@@ -155,7 +156,7 @@ def test_levels_that_the_files_state(stored: int) -> None:
     assert find(bright(100), stated=4095) == (WhiteLevel(4095, "file"), 0)
 
 
-def test_a_given_level_is_used_as_it_is() -> None:
+def test_a_given_level_is_used_as_it_is():
     images = clip(sphere()[0], 4095)
     assert find(images, given=4000) == (WhiteLevel(4000, "given"), np.count_nonzero(images >= 4000))
     assert find(images / 4095, given=1) == (
@@ -169,13 +170,13 @@ def test_a_given_level_is_used_as_it_is() -> None:
         find(images.astype(np.uint8), given=4095)
 
 
-def ls_error_deg(folder: Path, normals: NDArray[np.float64], **settings: float) -> float:
+def ls_error_deg(folder: Path, normals: Floats, **settings: float) -> float:
     capture = prepare_capture(open_capture(folder, CaptureOptions(**settings)))
     solution = np.linalg.lstsq(LIGHTS, capture.observations.T.astype(np.float64), rcond=None)[0]
     return float(angle_between_deg(unit(solution.T), normals.reshape(-1, 3)).mean())
 
 
-def test_12_bit_images_are_restored_like_16_bit_ones(tmp_path: Path) -> None:
+def test_12_bit_images_are_restored_like_16_bit_ones(tmp_path):
     images, normals = sphere()
     folder = write_capture(tmp_path / "vase", clip(images, 4095), LIGHTS)
     capture = prepare_capture(open_capture(folder))
@@ -186,7 +187,7 @@ def test_12_bit_images_are_restored_like_16_bit_ones(tmp_path: Path) -> None:
     assert stored.white_level == capture.white_level
     assert (capture.observations > stored.observations)[~capture.restored].sum() == 0
     brighter = (capture.observations > stored.observations).any(axis=1)
-    np.testing.assert_array_equal(capture.restored.any(axis=1), brighter)
+    assert_array_equal(capture.restored.any(axis=1), brighter)
     found = ls_error_deg(folder, normals)
     full = ls_error_deg(write_capture(tmp_path / "full", clip(images, 65_535), LIGHTS), normals)
     assert found == pytest.approx(full, abs=0.02)
@@ -197,7 +198,7 @@ def test_12_bit_images_are_restored_like_16_bit_ones(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("bits", "level"), [((12,), 4095), ((16,), None), ((12, 12, 12), 4095), ((5, 6, 5), None)]
 )
-def test_png_states_its_bits(tmp_path: Path, bits: tuple[int, ...], level: int | None) -> None:
+def test_png_states_its_bits(tmp_path, bits, level):
     images = bright(100)
     images[0, 0, 0] = 4095  # one pixel alone would not tell
     if len(bits) == 3:
@@ -217,7 +218,7 @@ def test_png_states_its_bits(tmp_path: Path, bits: tuple[int, ...], level: int |
     ("tag", "value", "level"),
     [(281, 4095, 4095), (281, 4001, None), (50717, 3839, 3839), (50717, 65_535, None)],
 )
-def test_tiff_states_its_level(tmp_path: Path, tag: int, value: int, level: int | None) -> None:
+def test_tiff_states_its_level(tmp_path, tag, value, level):
     folder = tmp_path / "vase"
     folder.mkdir()
     for number, image in enumerate(bright(100)):
@@ -250,7 +251,7 @@ def write_12_bit_tiff(path: Path, image: NDArray[np.uint16]) -> None:
     path.write_bytes(header + data + table)
 
 
-def test_tiff_of_12_bits_a_sample(tmp_path: Path) -> None:
+def test_tiff_of_12_bits_a_sample(tmp_path):
     images = clip(sphere()[0], 4095)
     for number, image in enumerate(images):
         write_12_bit_tiff(tmp_path / f"{number}.tif", image)
@@ -262,7 +263,7 @@ def test_tiff_of_12_bits_a_sample(tmp_path: Path) -> None:
 
 
 GRID_LIGHTS = np.array([(x, y, 1.4) for x in (-1, 0, 1) for y in (-1, 0, 1)], dtype=float)
-GRID_LIGHTS /= np.linalg.norm(GRID_LIGHTS, axis=1, keepdims=True)
+GRID_LIGHTS = unit(GRID_LIGHTS)
 
 
 def matte(pixels: int) -> np.ndarray:
@@ -286,7 +287,7 @@ def clipped_at(level: float) -> tuple[np.ndarray, ...]:
 
 def test_matte_pixels_come_back():
     truth, saturated, stored, restored = clipped_at(0.6)
-    np.testing.assert_array_equal(restored[~saturated], stored[~saturated])
+    assert_array_equal(restored[~saturated], stored[~saturated])
     assert (restored >= stored).all()
     known = saturated.any(axis=1) & ((~saturated).sum(axis=1) >= 4)
     assert known.sum() > 50

@@ -5,9 +5,10 @@ image, is known.
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
-from tests.scenes import shade, sphere_cap, spiral_lights
 
+from scenes import shade, sphere_cap, spiral_lights
 from splinecli.capture.arrays import open_arrays
 from splinecli.images.lens_blur import NOISE, REACH, inverse_filter, remove_blur, surroundings
 from splinecli.recipe import RecipeOptions, prepare_capture
@@ -30,7 +31,7 @@ def discs() -> Images:
                 rng.integers(20, FINER * SIDE - 20, 2).tolist(),
                 int(rng.integers(20, 60)),
             )
-            cv2.circle(image, middle, radius, 0.8, -1)  # type: ignore[call-overload]
+            cv2.circle(image, middle, radius, 0.8, -1)
     return np.asarray(images.reshape(8, SIDE, FINER, SIDE, FINER).mean(axis=(2, 4)), np.float32)
 
 
@@ -48,7 +49,7 @@ def removed(images: Images) -> tuple[Images, float | None]:
 
 @pytest.mark.parametrize("sigma", [0.5, 0.7, 1.0])
 @pytest.mark.parametrize("noise", [0.0, 0.01])
-def test_a_blur_is_found_and_removed(sigma: float, noise: float) -> None:
+def test_a_blur_is_found_and_removed(sigma, noise):
     sharp = discs()
     soft = blurred(sharp, sigma) + np.float32(noise) * np.random.default_rng(1).normal(
         size=sharp.shape
@@ -60,16 +61,16 @@ def test_a_blur_is_found_and_removed(sigma: float, noise: float) -> None:
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
-def test_sharp_images_stay_as_they_are(noise: float) -> None:
+def test_sharp_images_stay_as_they_are(noise):
     images = (discs() + noise * np.random.default_rng(1).normal(size=(8, SIDE, SIDE))).astype(
         np.float32
     )
     found, estimate = removed(images)
     assert estimate is None
-    np.testing.assert_array_equal(found, images)
+    assert_array_equal(found, images)
 
 
-def test_fine_texture_stays_as_it_is() -> None:
+def test_fine_texture_stays_as_it_is():
     """Each pixel has an albedo of its own."""
     rng = np.random.default_rng(2)
     images = (rng.uniform(0.2, 1, (SIDE, SIDE)) * rng.uniform(0.3, 0.8, (8, 1, 1))).astype(
@@ -79,14 +80,14 @@ def test_fine_texture_stays_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("gloss", [0.0, 0.5])
-def test_images_without_edges_stay_as_they_are(gloss: float) -> None:
+def test_images_without_edges_stay_as_they_are(gloss):
     """Shading alone looks like the widest blur."""
     shading = shade(sphere_cap(SIDE), spiral_lights(8, 60), gloss=gloss)
     assert removed(np.moveaxis(shading, 2, 0).astype(np.float32))[1] is None
     assert removed(np.full((8, SIDE, SIDE), 0.5, np.float32))[1] is None
 
 
-def test_the_filter_inverts_what_noise_leaves_of_the_signal() -> None:
+def test_the_filter_inverts_what_noise_leaves_of_the_signal():
     """Wiener's transfer function, where power and noise are those of the docstring, and the filter
     is long enough.
     """
@@ -98,10 +99,10 @@ def test_the_filter_inverts_what_noise_leaves_of_the_signal() -> None:
     expected = g / (g**2 + NOISE * mean_power * frequency**2)
     waves = np.cos(2 * np.pi * frequency * np.arange(-REACH, REACH + 1))
     found = waves @ inverse_filter(sigma).sum(axis=0)
-    np.testing.assert_allclose(found, expected[:, 0], rtol=0.05)
+    assert_allclose(found, expected[:, 0], rtol=0.05)
 
 
-def test_only_the_object_and_what_surrounds_it_is_needed() -> None:
+def test_only_the_object_and_what_surrounds_it_is_needed():
     """The observations of a disc are the same from the whole images as from a mask and the pixels
     around it.
     """
@@ -116,10 +117,10 @@ def test_only_the_object_and_what_surrounds_it_is_needed() -> None:
     far = np.where(mask | around, images, 7)  # the filter must not see these
     other = np.concatenate((far[:, mask], far[:, around]), axis=1).T.copy()
     remove_blur(other, mask, around)
-    np.testing.assert_array_equal(part, other)
+    assert_array_equal(part, other)
 
 
-def test_values_outside_the_mask_may_be_no_light() -> None:
+def test_values_outside_the_mask_may_be_no_light():
     images = blurred(discs(), 0.7)
     mask = np.hypot(*(np.mgrid[:SIDE, :SIDE] - SIDE // 2)) < SIDE / 3
     lights = np.array([(np.cos(angle), np.sin(angle), 1.5) for angle in np.linspace(0, 5, 8)])
@@ -130,7 +131,7 @@ def test_values_outside_the_mask_may_be_no_light() -> None:
     assert np.isfinite(capture.observations).all() and capture.observations.min() >= 0
 
 
-def test_stored_values_stay_as_they_are() -> None:
+def test_stored_values_stay_as_they_are():
     images = blurred(discs(), 0.7)
     lights = np.array([(np.cos(angle), np.sin(angle), 1.5) for angle in np.linspace(0, 5, 8)])
     capture = prepare_capture(
@@ -138,8 +139,6 @@ def test_stored_values_stay_as_they_are() -> None:
         options=RecipeOptions(as_stored=True),
     )
     assert capture.removed_blur is None
-    np.testing.assert_allclose(capture.observations, images.reshape(8, -1).T, rtol=1e-5)
+    assert_allclose(capture.observations, images.reshape(8, -1).T, rtol=1e-5)
     sharpened = prepare_capture(open_arrays(images, lights, light_intensities=np.ones(8)))
-    np.testing.assert_allclose(
-        sharpened.observations.T.reshape(images.shape), removed(images)[0], atol=1e-4
-    )
+    assert_allclose(sharpened.observations.T.reshape(images.shape), removed(images)[0], atol=1e-4)

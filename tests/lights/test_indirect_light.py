@@ -74,7 +74,7 @@ def found_in(
     )
 
 
-def test_a_bowls_light_on_itself_is_found_at_any_exposure() -> None:
+def test_a_bowls_light_on_itself_is_found_at_any_exposure():
     direct, indirect = 5 * DIRECT, 5 * INDIRECT
     found = found_in(BOWL, direct + indirect)
     ratio = (found.at(EVERYWHERE) / indirect)[INSIDE]
@@ -87,7 +87,7 @@ def test_a_bowls_light_on_itself_is_found_at_any_exposure() -> None:
 @pytest.mark.parametrize(
     "camera_matrix", [None, np.array(((200, 0, 31.5), (0, 200, 31.5), (0, 0, 1.0)))]
 )
-def test_it_is_found_under_near_lamps(camera_matrix: NDArray[np.floating] | None) -> None:
+def test_it_is_found_under_near_lamps(camera_matrix):
     points = np.stack((X[MASK], Y[MASK], -BOWL[:, 2]), axis=1)
     points[:, 2] -= points[:, 2].mean()
     distances = np.where(np.arange(10) % 2, 3.0, 2.0)[:, None]
@@ -98,14 +98,14 @@ def test_it_is_found_under_near_lamps(camera_matrix: NDArray[np.floating] | None
     direct, indirect = direct_and_indirect(BOWL, *lamps.light_at(points))
     seen = direct + indirect
 
-    def lighting_at(rows: NDArray[np.integer]) -> PixelLighting:
+    def lighting_at(rows):
         return PixelLighting.of(seen[rows], lamps.choose_pixels(rows))
 
     found = find_indirect_light(MASK, seen, lighting_at, BOWL.astype(np.float32))
     assert (found.at(EVERYWHERE) / indirect)[INSIDE].mean() == pytest.approx(1, abs=0.05)
 
 
-def test_a_dark_background_changes_nothing() -> None:
+def test_a_dark_background_changes_nothing():
     alone = found_in(BOWL, DIRECT + INDIRECT)
     mask = np.ones((640, 640), np.bool_)
     normals = np.tile(np.array((0, 0, 1), np.float32), (*mask.shape, 1))
@@ -121,18 +121,18 @@ def test_a_dark_background_changes_nothing() -> None:
     assert ratio[INSIDE].mean() == pytest.approx(1, abs=0.05)
 
 
-def test_a_ball_receives_none_even_with_ambient_light() -> None:
+def test_a_ball_receives_none_even_with_ambient_light():
     direct = direct_and_indirect(OUTWARDS)[0]
     assert found_in(OUTWARDS, direct) is None
     assert found_in(OUTWARDS, direct + np.float32(0.05)) is None
 
 
-def test_ambient_light_is_separated_from_indirect_light() -> None:
+def test_ambient_light_is_separated_from_indirect_light():
     found = found_in(BOWL, DIRECT + INDIRECT + (0.03 * ALBEDO).astype(np.float32))
     assert (found.at(EVERYWHERE) / INDIRECT)[INSIDE].mean() == pytest.approx(1, abs=0.15)
 
 
-def test_nothing_is_removed_where_shadows_do_not_show_it() -> None:
+def test_nothing_is_removed_where_shadows_do_not_show_it():
     """Black shadows, as in a bowl that reflects into one direction only; and shadows that follow
     something else.
     """
@@ -142,15 +142,15 @@ def test_nothing_is_removed_where_shadows_do_not_show_it() -> None:
     assert found_in(BOWL, np.zeros_like(DIRECT)) is None
 
 
-def test_no_more_is_removed_than_the_brightest_albedo_allows() -> None:
+def test_no_more_is_removed_than_the_brightest_albedo_allows():
     found = found_in(BOWL, DIRECT + 20 * INDIRECT)
     assert 1.3 < found.albedo.max() < 1.6
 
 
-def test_shipped_weights_estimate_a_bowl_better_without_its_own_light() -> None:
+def test_shipped_weights_estimate_a_bowl_better_without_its_own_light():
     estimator = make_estimator("spline-net")
 
-    def mean_error_deg() -> float:
+    def mean_error_deg():
         found = estimate_normals(CAPTURE, estimator).normal_map[MASK]
         return float(angle_between_deg(found, BOWL).mean())
 
@@ -159,7 +159,7 @@ def test_shipped_weights_estimate_a_bowl_better_without_its_own_light() -> None:
         assert without < 0.6 * mean_error_deg()
 
 
-def test_the_refinement_sees_what_is_left() -> None:
+def test_the_refinement_sees_what_is_left():
     with patch.object(NetworkRefiner, "refine") as refine:
         estimate_normals(CAPTURE, make_estimator("spline-net"))
     _, _, lighting_at, *_ = refine.call_args.args
@@ -168,10 +168,10 @@ def test_the_refinement_sees_what_is_left() -> None:
     )
 
 
-def test_the_refinement_net_learns_from_what_it_sees_in_use() -> None:
+def test_the_refinement_net_learns_from_what_it_sees_in_use():
     estimator = make_estimator("spline-net", MethodOptions(precision="float32"))
     features = pixel_features(
-        estimator.network,
+        estimator.network,  # type: ignore[attr-defined]
         torch.from_numpy(CAPTURE.observations),
         torch.from_numpy(LIGHTS).float(),
         torch.tensor(MASK),

@@ -2,18 +2,16 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from scenes import Floats
 from splinecli.capture import Capture
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.errors import UsageError
 from splinecli.lights.light_fit import find_factors, refine_capture, refine_lights, would_refine
 from splinecli.maths.normals import angle_between_deg, unit
 
-Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
-
-def rough(lights: NDArray[np.float64], sigma_deg: float, seed: int = 0) -> NDArray[np.float64]:
+def rough(lights: Floats, sigma_deg: float, seed: int = 0) -> Floats:
     """Lights with Gaussian errors across each, whose angle has this root mean square."""
     errors = np.random.default_rng(seed).normal(
         scale=np.radians(sigma_deg) / np.sqrt(2), size=lights.shape
@@ -21,7 +19,7 @@ def rough(lights: NDArray[np.float64], sigma_deg: float, seed: int = 0) -> NDArr
     return unit(lights + errors - (errors * lights).sum(axis=1, keepdims=True) * lights)
 
 
-def aligned_error_deg(found: NDArray[np.float64], true: NDArray[np.float64]) -> float:
+def aligned_error_deg(found: Floats, true: Floats) -> float:
     """The mean angle after the best common rotation, which the images leave open."""
     u, _, v = np.linalg.svd(found.T @ true)
     rotation = u @ np.diag((1, 1, np.linalg.det(u @ v))) @ v
@@ -29,9 +27,7 @@ def aligned_error_deg(found: NDArray[np.float64], true: NDArray[np.float64]) -> 
 
 
 @pytest.mark.parametrize("sigma_deg", [4.0, 8.0])
-def test_matte_pixels_determine_lights_up_to_a_rotation(
-    sigma_deg: float, matte_pixels: Pixels
-) -> None:
+def test_matte_pixels_determine_lights_up_to_a_rotation(sigma_deg, matte_pixels):
     _, lights, observations = matte_pixels
     given = rough(lights, sigma_deg)
     found = refine_lights(observations.astype(np.float32), given, error_deg=sigma_deg)
@@ -45,7 +41,7 @@ def test_matte_pixels_determine_lights_up_to_a_rotation(
     np.testing.assert_allclose(found.intensities, 1, atol=1e-6)
 
 
-def test_a_light_that_no_pixel_shows_stays(matte_pixels: Pixels) -> None:
+def test_a_light_that_no_pixel_shows_stays(matte_pixels):
     _, lights, observations = matte_pixels
     given, black = rough(lights, 4.0), observations.astype(np.float32)
     black[:, 5] = 0
@@ -54,7 +50,7 @@ def test_a_light_that_no_pixel_shows_stays(matte_pixels: Pixels) -> None:
     assert angle_between_deg(found.directions, given)[5] < 0.1
 
 
-def test_unknown_intensities_are_refined_too(matte_pixels: Pixels) -> None:
+def test_unknown_intensities_are_refined_too(matte_pixels):
     _, lights, observations = matte_pixels
     strengths = np.random.default_rng(3).uniform(0.85, 1.15, 12)
     given = rough(lights, 4.0)
@@ -69,7 +65,7 @@ def test_unknown_intensities_are_refined_too(matte_pixels: Pixels) -> None:
     )
 
 
-def test_exact_lights_stay(glossy_pixels: Pixels) -> None:
+def test_exact_lights_stay(glossy_pixels):
     """Highlights and shadows do not move lights that are right; nothing is taken from too few
     pixels or lights.
     """
@@ -85,7 +81,7 @@ def test_exact_lights_stay(glossy_pixels: Pixels) -> None:
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_refinement_is_suggested_for_rough_lights_alone(known: bool, glossy_pixels: Pixels) -> None:
+def test_refinement_is_suggested_for_rough_lights_alone(known, glossy_pixels):
     _, lights, observations = glossy_pixels
     strengths = 1.0 if known else np.linspace(0.6, 1.4, len(lights))
     observations = np.tile(observations, (3, 1)) * strengths
@@ -95,7 +91,7 @@ def test_refinement_is_suggested_for_rough_lights_alone(known: bool, glossy_pixe
     assert would_refine(observations, None, rough(lights, 6.0)) is None
 
 
-def test_a_capture_says_what_was_done(matte_pixels: Pixels) -> None:
+def test_a_capture_says_what_was_done(matte_pixels):
     _, lights, observations = matte_pixels
     given = rough(lights, 4.0)
     capture = Capture(

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from scenes import cap_directions, ring_lights, shade, sphere, sphere_cap, square_grid
+from scenes import Floats, cap_directions, ring_lights, shade, sphere, sphere_cap, square_grid
 from splinecli import estimate_normals
 from splinecli.errors import InputError, UsageError
 from splinecli.estimate.confidence import add_common_error
@@ -25,11 +26,11 @@ SIZE = 64
 NORMALS, INSIDE = sphere(SIZE)
 
 
-def lights(count: int = 10, seed: int = 1) -> NDArray[np.float64]:
+def lights(count: int = 10, seed: int = 1) -> Floats:
     return cap_directions(count, 55, seed, even=True)
 
 
-def observed(directions: NDArray[np.float64], **gloss: float) -> NDArray[np.float32]:
+def observed(directions: Floats, **gloss: float) -> NDArray[np.float32]:
     return shade(NORMALS[INSIDE], directions, noise=0.002, **gloss).astype(np.float32)
 
 
@@ -39,22 +40,22 @@ def images_of(observations: NDArray[np.float32]) -> NDArray[np.float32]:
     return images
 
 
-def mean_angle(found: NDArray[np.float64], true: NDArray[np.float64]) -> float:
+def mean_angle(found: Floats, true: Floats) -> float:
     return float(angle_between_deg(found, true).mean())
 
 
 @pytest.mark.parametrize("gloss", [0.0, 0.5])
 @pytest.mark.parametrize("count", [4, 10, 40])
-def test_a_sphere(count: int, gloss: float) -> None:
+def test_a_sphere(count, gloss):
     true = lights(count)
     found = find_lights(observed(true, gloss=gloss), INSIDE, True)
     assert found.intensities is None
     assert mean_angle(found.directions, true) < 5
     assert mean_angle(found.directions, true) < 3 * found.errors_deg.mean()
-    np.testing.assert_allclose(np.linalg.norm(found.directions, axis=1), 1)
+    assert_allclose(np.linalg.norm(found.directions, axis=1), 1)
 
 
-def test_intensities_are_found_with_the_directions() -> None:
+def test_intensities_are_found_with_the_directions():
     true, intensities = lights(), np.random.default_rng(3).uniform(0.7, 1.4, 10)
     intensities /= intensities.mean()
     found = find_lights(observed(true) * intensities.astype(np.float32), INSIDE, False)
@@ -63,7 +64,7 @@ def test_intensities_are_found_with_the_directions() -> None:
     assert np.abs(found.intensities / intensities - 1).mean() < 0.5 * np.abs(intensities - 1).mean()
 
 
-def test_the_number_of_threads_changes_nothing() -> None:
+def test_the_number_of_threads_changes_nothing():
     """Rounding alone could move a light into another cell of an observation map."""
     before = torch.get_num_threads()
     try:
@@ -73,11 +74,11 @@ def test_the_number_of_threads_changes_nothing() -> None:
             found.append(find_lights(observed(lights()), INSIDE, True).directions)
     finally:
         torch.set_num_threads(before)
-    np.testing.assert_array_equal(found[1], found[0])
-    np.testing.assert_array_equal(found[2], found[0])
+    assert_array_equal(found[1], found[0])
+    assert_array_equal(found[2], found[0])
 
 
-def test_a_turned_camera_turns_the_lights() -> None:
+def test_a_turned_camera_turns_the_lights():
     """All eight turns and mirror images are seen, so none is preferred."""
     true = lights()
     images = images_of(observed(true, gloss=0.3))
@@ -91,7 +92,7 @@ def test_a_turned_camera_turns_the_lights() -> None:
     assert mean_angle(found.directions, np.stack((-y, x, z), axis=1)) < 0.2
 
 
-def test_what_shows_no_object_is_refused() -> None:
+def test_what_shows_no_object_is_refused():
     n_pixels, rng = int(INSIDE.sum()), np.random.default_rng(0)
     normals, disc = sphere(400)
     ring = disc & ~sphere(400, 0.96)[1]
@@ -109,7 +110,7 @@ def test_what_shows_no_object_is_refused() -> None:
             find_lights(observations.astype(np.float32), mask, True)
 
 
-def test_a_first_light_from_another_side_decides_nothing() -> None:
+def test_a_first_light_from_another_side_decides_nothing():
     true = lights()
     true[0] = (0.0, 0.6, 0.8)
     with pytest.raises(InputError, match=r"does not come clearly from left.* --first-light 45"):
@@ -121,7 +122,7 @@ def test_a_first_light_from_another_side_decides_nothing() -> None:
 @pytest.mark.parametrize(
     ("side", "azimuth_deg"), [("upper-right", 45), ("90", 90), ("lower-left", 225), ("-45", 315)]
 )
-def test_the_first_light_may_come_from_any_direction(side: str, azimuth_deg: float) -> None:
+def test_the_first_light_may_come_from_any_direction(side, azimuth_deg):
     true = lights()
     azimuth = np.radians(azimuth_deg)
     true[0] = (0.6 * np.cos(azimuth), 0.6 * np.sin(azimuth), 0.8)
@@ -133,7 +134,7 @@ def test_the_first_light_may_come_from_any_direction(side: str, azimuth_deg: flo
         find_lights(observed(true), INSIDE, True, first_light=side + "x")
 
 
-def test_holes_and_narrow_borders_are_no_outline() -> None:
+def test_holes_and_narrow_borders_are_no_outline():
     mask = np.ones((200, 200), np.bool_)
     mask[80:120, 80:120] = False
     assert outline_share(mask) == 0
@@ -143,7 +144,7 @@ def test_holes_and_narrow_borders_are_no_outline() -> None:
 
 
 @pytest.mark.parametrize("hollow", [False, True])
-def test_without_outline_the_first_light_decides_between_bump_and_hollow(hollow: bool) -> None:
+def test_without_outline_the_first_light_decides_between_bump_and_hollow(hollow):
     """A matte hollow shows the same as a bump under opposite lights."""
     everywhere, true = np.ones((SIZE, SIZE), np.bool_), lights()
     true[0] = (-0.6, 0.0, 0.8)
@@ -152,8 +153,8 @@ def test_without_outline_the_first_light_decides_between_bump_and_hollow(hollow:
     with pytest.raises(
         InputError,
         match=(
-            r"a bump looks like a hollow .* add --auto-mask, or give its mask\. .*"
-            r" --first-light left"
+            r"a bump looks like a hollow .* add --auto-mask, or give its mask\. .* --first-light "
+            r"left"
         ),
     ):
         find_lights(images, everywhere, True)
@@ -162,7 +163,7 @@ def test_without_outline_the_first_light_decides_between_bump_and_hollow(hollow:
 
 
 @pytest.mark.parametrize("turn_deg", [(8, 0, 0), (0, -6, 0), (3, 4, 5)])
-def test_the_outline_shows_a_common_turn(turn_deg: tuple[float, float, float]) -> None:
+def test_the_outline_shows_a_common_turn(turn_deg):
     true = lights(20)
     turn = Rotation.from_rotvec(turn_deg, degrees=True)
     found = turn_at_outline(observed(true), INSIDE, turn.apply(true))
@@ -174,20 +175,20 @@ def test_the_outline_shows_a_common_turn(turn_deg: tuple[float, float, float]) -
     assert half.magnitude() == pytest.approx(shown.magnitude() / 2)
 
 
-def test_the_border_of_the_image_is_no_outline() -> None:
+def test_the_border_of_the_image_is_no_outline():
     everywhere = np.ones((SIZE, SIZE), np.bool_)
     values = shade(sphere_cap(SIZE)[everywhere], lights()).astype(np.float32)
     assert turn_at_outline(values, everywhere, lights()) is None
 
 
-def test_confidence_includes_the_lights() -> None:
+def test_confidence_includes_the_lights():
     errors = np.array([[np.log(0.03), 1.0], [np.log(0.5), 1.0]], np.float32)
     add_common_error(errors, 3.0)
     turn = np.radians(3.0)
-    np.testing.assert_allclose(np.exp(errors[:, 0]), np.hypot((0.03, 0.5), turn), rtol=1e-5)
+    assert_allclose(np.exp(errors[:, 0]), np.hypot((0.03, 0.5), turn), rtol=1e-5)
 
 
-def test_python() -> None:
+def test_python():
     true = lights()
     images = images_of(observed(true))
     estimate = estimate_normals(images, None, INSIDE, method="ls")
@@ -206,7 +207,7 @@ def test_python() -> None:
             estimate_normals(images, lights_given, INSIDE, **options)
 
 
-Array = NDArray[np.float64]
+Array = Floats
 
 OPPOSITE = (-1, -1, 1)
 
@@ -235,14 +236,14 @@ def cap_on_plate(size: int, lights: Array, *, hollow: bool) -> NDArray[np.float3
 
 @pytest.mark.parametrize("zenith_deg", [60, 70])
 @pytest.mark.parametrize("hollow", [False, True])
-def test_cast_shadows_tell_a_bump_from_a_hollow(hollow: bool, zenith_deg: float) -> None:
+def test_cast_shadows_tell_a_bump_from_a_hollow(hollow, zenith_deg):
     lights, mask = ring_lights(10, zenith_deg), np.ones((64, 64), np.bool_)
     images = cap_on_plate(64, lights, hollow=hollow)
     assert bump_log_odds(images, mask, lights) > 3
     assert bump_log_odds(images, mask, lights * OPPOSITE) < -3
 
 
-def test_the_outline_tells_a_bump_from_a_hollow() -> None:
+def test_the_outline_tells_a_bump_from_a_hollow():
     normals, inside = sphere(64)
     lights = ring_lights(8, 40)
     images = shade(normals[inside], lights, noise=0.002).astype(np.float32)
@@ -251,9 +252,7 @@ def test_the_outline_tells_a_bump_from_a_hollow() -> None:
 
 
 @pytest.mark.parametrize("hollow", [False, True])
-def test_a_wrong_guess_of_the_network_is_turned_around(
-    hollow: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wrong_guess_of_the_network_is_turned_around(hollow, monkeypatch):
     lights, mask = ring_lights(10, 60), np.ones((64, 64), np.bool_)
     guess = lights * OPPOSITE, np.full(10, 16.0), np.ones(10)
     monkeypatch.setattr(unknown_lights, "_ask_network", lambda *_: guess)
@@ -262,7 +261,7 @@ def test_a_wrong_guess_of_the_network_is_turned_around(
 
 
 @pytest.mark.parametrize("raised", [1.0, 1.6])
-def test_low_lights_are_lowered_until_the_albedo_is_even(raised: float) -> None:
+def test_low_lights_are_lowered_until_the_albedo_is_even(raised):
     normals, inside = sphere(64)
     lights = ring_lights(8, 65)
     images = shade(normals[inside], lights, noise=0.002).astype(np.float32)
@@ -274,8 +273,8 @@ def test_low_lights_are_lowered_until_the_albedo_is_even(raised: float) -> None:
     assert after <= max(0.5 * before, 0.5)
 
 
-def test_high_lights_are_not_lowered() -> None:
+def test_high_lights_are_not_lowered():
     normals, inside = sphere(64)
     lights = ring_lights(8, 30)
     images = shade(normals[inside], lights).astype(np.float32)
-    np.testing.assert_array_equal(lower_lights(images, lights, 10.0), lights)
+    assert_array_equal(lower_lights(images, lights, 10.0), lights)

@@ -2,7 +2,6 @@
 rendered scene.
 """
 
-import json
 from pathlib import Path
 
 import cv2
@@ -10,9 +9,10 @@ import jsonschema
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 from glb_file import read_glb
-from scenes import cap_directions, sphere, write_capture
+from scenes import cap_directions, read_json, sphere, to_uint16, write_capture
 from splinecli import estimate_material
 from splinecli.capture import open_capture
 from splinecli.errors import InputError, UsageError
@@ -23,6 +23,7 @@ from splinecli.lights.lighting import PixelLighting
 from splinecli.materials import maps
 from splinecli.materials.maps import MaterialMaps, render_gray
 from splinecli.materials.material_net import material_networks
+from splinecli.maths.normals import unit
 from splinecli.pipeline.evaluate import evaluate_captures
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
@@ -47,7 +48,7 @@ def ggx_sphere(lights, *, diffuse, f0, roughness):
     """
     alpha = roughness**2
     half = lights + np.array((0, 0, 1.0))
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    half = unit(half)
     n_l, n_h, n_v = (NORMALS @ lights.T).clip(0), (NORMALS @ half.T).clip(0), NORMALS[:, 2:]
     facets = alpha**2 / (np.pi * (n_h**2 * (alpha**2 - 1) + 1) ** 2)
 
@@ -116,8 +117,8 @@ def test_units_and_order_of_lights():
     turned = material(observations[:, ::-1].copy(), LIGHTS[::-1])
     assert bright.exposure == pytest.approx(7 * plain.exposure, rel=1e-3)
     for name in ("base_colour", "roughness", "metalness", "specular", "confidence"):
-        np.testing.assert_allclose(getattr(bright, name), getattr(plain, name), atol=1e-3)
-        np.testing.assert_allclose(getattr(turned, name), getattr(plain, name), atol=1e-3)
+        assert_allclose(getattr(bright, name), getattr(plain, name), atol=1e-3)
+        assert_allclose(getattr(turned, name), getattr(plain, name), atol=1e-3)
 
 
 def test_generated_pixels_that_training_did_not_use():
@@ -138,7 +139,7 @@ def test_generated_pixels_that_training_did_not_use():
                 batch.observations, batch.light_directions, batch.valid, captures=batch.captures
             )
             gloss, _ = material_net(pixels, context.brightness)
-            true = batch.truth.material
+            true = batch.truth.material  # type: ignore[attr-defined]
             wrong = (gloss.roughness - true.roughness[:, 0]).abs()
             is_right = (gloss.metalness > 0.5) == (true.metallic[:, 0] > 0.5)
             rows.append(
@@ -208,8 +209,8 @@ def test_channels_of_the_pictures():
     assert pictures["metallic_roughness.png"][middle][::-1].tolist() == [255, 51, 204]
     assert pictures["base_colour.png"][middle][::-1].tolist() == [255, 188, 0]  # sRGB of 0.5 is 188
     assert pictures["specular.png"][middle] == 255  # 8 bits end at 1
-    assert files["specular.npy"][middle] == 3
-    assert not files["roughness.npy"][0, 0]
+    assert files["specular.npy"][middle] == 3  # type: ignore[index]
+    assert not files["roughness.npy"][0, 0]  # type: ignore[index]
     assert not material_facts(values, MASK).gray
 
 
@@ -218,7 +219,7 @@ def glossy(tmp_path: Path) -> Path:
     """A gray capture of a glossy sphere."""
     images = np.zeros((len(LIGHTS), SIZE, SIZE))
     images[:, MASK] = ggx_sphere(LIGHTS, diffuse=0.3, f0=0.05, roughness=0.4).T
-    stored = np.rint(images.clip(0, 1) * 65535).astype(np.uint16)
+    stored = to_uint16(images.clip(0, 1) * 65535)
     return write_capture(
         tmp_path / "ball", stored, LIGHTS, mask=MASK, normals=NORMAL_MAP * MASK[..., None]
     )
@@ -241,7 +242,7 @@ def test_infer_writes_the_maps_and_a_gloss_for_the_mesh(glossy, tmp_path):
     assert {"baseColorTexture", "metallicRoughnessTexture"} <= set(gloss)
     assert (gloss.get("metallicFactor", 1), gloss.get("roughnessFactor", 1)) == (1, 1)
     stored = cv2.imread(str(folder / "metallic_roughness.png"))[..., ::-1]
-    np.testing.assert_array_equal(arrays["gloss"][MASK], stored[MASK])
+    assert_array_equal(arrays["gloss"][MASK], stored[MASK])
 
 
 def test_coloured_lamps_do_not_tint_gray_images(glossy, tmp_path):
@@ -333,10 +334,8 @@ def test_evaluate_compares_with_photographs_that_were_held_out(glossy, tmp_path)
     )
     assert found["material"]["psnr_db"] > found["lambertian"]["psnr_db"] + 1
     assert found["lambertian"]["psnr_db"] > found["nearest"]["psnr_db"]
-    written = json.loads((tmp_path / "scores/results.json").read_text("utf-8"))
-    schema = json.loads(
-        (Path(__file__).resolve().parents[2] / "docs/reports.schema.json").read_text("utf-8")
-    )
+    written = read_json(tmp_path / "scores/results.json")
+    schema = read_json(Path(__file__).resolve().parents[2] / "docs/reports.schema.json")
     jsonschema.Draft202012Validator({**schema, "$ref": "#/$defs/Results"}).validate(written)
 
 
@@ -363,11 +362,11 @@ def test_unequal_white_balance_changes_the_base_colour_alone(glossy):
     white, tinted = estimate_material(estimate, images), estimate_material(estimate, images * gains)
     assert white.is_gray
     assert not tinted.is_gray
-    np.testing.assert_array_equal(tinted.roughness, white.roughness)
-    np.testing.assert_array_equal(tinted.metalness, white.metalness)
+    assert_array_equal(tinted.roughness, white.roughness)
+    assert_array_equal(tinted.metalness, white.metalness)
     ratio = np.median(tinted.base_colour / white.base_colour, axis=0)
     # white highlights are assumed to be white
-    np.testing.assert_allclose(ratio / ratio[1], gains, atol=0.1)
+    assert_allclose(ratio / ratio[1], gains, atol=0.1)
 
 
 def test_integrate_keeps_the_material(glossy, tmp_path):
@@ -377,4 +376,4 @@ def test_integrate_keeps_the_material(glossy, tmp_path):
     integrate_normal_map(IntegrateOptions(normals=tmp_path / "out/ball"))
     _, arrays = read_glb((tmp_path / "out/ball/mesh.glb").read_bytes())
     stored = cv2.imread(str(tmp_path / "out/ball/metallic_roughness.png"))[..., ::-1]
-    np.testing.assert_array_equal(arrays["gloss"][MASK], stored[MASK])
+    assert_array_equal(arrays["gloss"][MASK], stored[MASK])

@@ -3,14 +3,15 @@ there.
 """
 
 import math
-from typing import Any
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
+from torch.testing import assert_close
 
+from distributions import seeded
 from splinecli.maths.observation_map import (
     cell_directions,
     light_cells,
@@ -28,7 +29,7 @@ def random_rig(seed: int, pixels: int, lights: int) -> tuple[Tensor, Tensor]:
     """Observations (P, F) and shared directions (F, 3) in float64: no light falls on the border of
     a cell.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     directions = torch.randn(lights, 3, generator=generator, dtype=torch.float64)
     directions[:, 2] = directions[:, 2].abs() + 0.05
     observations = torch.rand(pixels, lights, generator=generator, dtype=torch.float64)
@@ -68,7 +69,7 @@ CELLS = {
 
 
 @pytest.mark.parametrize("grid", CELLS)
-def test_cell_of_a_known_direction(grid: Any) -> None:
+def test_cell_of_a_known_direction(grid):
     options = {} if grid == "ours" else {"grid": grid}
     for x, y, row, column in CELLS[grid]:
         direction = torch.tensor(
@@ -79,7 +80,7 @@ def test_cell_of_a_known_direction(grid: Any) -> None:
         assert occupied.flatten().nonzero().item() == row * 32 + column, (x, y)
 
 
-def test_the_disc_of_both_grids() -> None:
+def test_the_disc_of_both_grids():
     # By counting the odd a, b within 31 and 32 of the origin.
     assert unit_disc(32).sum() == 812
     assert torch.equal(unit_disc(32), cell_directions(32)[1])
@@ -91,7 +92,7 @@ def test_the_disc_of_both_grids() -> None:
 
 
 @pytest.mark.parametrize("size", [8, 31, 32, 64])
-def test_every_cell_centre_lies_in_its_own_cell(size: int) -> None:
+def test_every_cell_centre_lies_in_its_own_cell(size):
     directions, inside = cell_directions(size)
     expected = torch.arange(size * size).view(size, size)
     assert torch.equal(light_cells(directions, size)[inside], expected[inside])
@@ -99,23 +100,23 @@ def test_every_cell_centre_lies_in_its_own_cell(size: int) -> None:
     assert not directions[~inside].any()
 
 
-def test_lights_in_one_cell_are_averaged() -> None:
+def test_lights_in_one_cell_are_averaged():
     directions = torch.tensor(
         [[0.01, 0.01, 1.0], [0.02, 0.03, 1.0], [0.05, 0.01, 1.0], [0.5, 0.5, 0.7]]
     )
     values = torch.tensor([[[1.0, 10.0], [0.0, 20.0], [0.5, 60.0], [0.3, 7.0]]])
     maps = sparse_map(values, directions)
-    torch.testing.assert_close(maps.values[0, :, 15, 16], torch.tensor([0.5, 30.0]))
+    assert_close(maps.values[0, :, 15, 16], torch.tensor([0.5, 30.0]))
     assert maps.occupied.sum() == 2
     assert maps.occupied[0, 0, 15, 16] == 1
 
 
-def test_lights_that_are_not_valid_leave_no_trace() -> None:
+def test_lights_that_are_not_valid_leave_no_trace():
     observations, directions = random_rig(1, 3, 12)
     valid = torch.arange(12) % 3 != 0
     with_flags = sparse_map(observations, directions, valid.expand(3, 12))
     without = sparse_map(observations[:, valid], directions[valid])
-    torch.testing.assert_close(with_flags.values, without.values)
+    assert_close(with_flags.values, without.values)
     assert torch.equal(with_flags.occupied, without.occupied)
     bright = torch.where(valid, observations, 100.0)
     assert torch.equal(map_scale(bright, valid.expand(3, 12)), map_scale(observations[:, valid]))
@@ -139,13 +140,13 @@ SYMMETRIES = {
 @pytest.mark.parametrize("name", SYMMETRIES)
 @quick
 @given(SEEDS)
-def test_maps_follow_the_lights(name: str, seed: int) -> None:
+def test_maps_follow_the_lights(name, seed):
     change, changed = SYMMETRIES[name]
     observations, directions = random_rig(seed, 3, 20)
-    order = torch.randperm(20, generator=torch.Generator().manual_seed(seed))
+    order = torch.randperm(20, generator=seeded(seed))
     one, other = (
         sparse_map(observations, directions),
         sparse_map(observations[:, order], change(directions)[order]),
     )
-    torch.testing.assert_close(other.values, changed(one.values))
+    assert_close(other.values, changed(one.values))
     assert torch.equal(other.occupied, changed(one.occupied))

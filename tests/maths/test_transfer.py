@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
@@ -20,13 +21,7 @@ from scenes import with_chunk
 from splinecli.capture import open_capture
 from splinecli.capture.formats.facts import StatedCurve, read_header
 from splinecli.errors import UsageError
-from splinecli.maths.transfer import (
-    TransferCurve,
-    decode_transfer,
-    encode_srgb,
-    parse_transfer,
-    profile_curve,
-)
+from splinecli.maths.transfer import decode_transfer, encode_srgb, parse_transfer, profile_curve
 from splinecli.recipe import read_capture
 
 SRGB_PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
@@ -98,7 +93,7 @@ SRGB_PARAMETERS = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
         (profile(curv(461), space=b"GRAY"), 1.8008),
     ],
 )
-def test_curves_with_a_name(icc: bytes, expected: TransferCurve) -> None:
+def test_curves_with_a_name(icc, expected):
     found = profile_curve(icc)
     assert found is not None and found[1] == expected
 
@@ -111,10 +106,10 @@ def test_curves_with_a_name(icc: bytes, expected: TransferCurve) -> None:
         (curv(0, 10_000, 65_535), lambda x: np.interp(x, (0, 0.5, 1), (0, 10_000 / 65_535, 1))),
     ],
 )
-def test_curves_without_a_name(curve: bytes, expected: Any) -> None:
+def test_curves_without_a_name(curve, expected):
     found = profile_curve(profile(curve))
     assert found is not None and isinstance(found[1], tuple)
-    np.testing.assert_allclose(decode_transfer(STORED, found[1]), expected(STORED), atol=2e-4)
+    assert_allclose(decode_transfer(STORED, found[1]), expected(STORED), atol=2e-4)
 
 
 @pytest.mark.parametrize(
@@ -134,12 +129,12 @@ def test_curves_without_a_name(curve: bytes, expected: Any) -> None:
         bytes(36) + b"acsp" + bytes(88) + b"\xff" * 4,
     ],
 )
-def test_profiles_without_a_usable_curve(icc: bytes) -> None:
+def test_profiles_without_a_usable_curve(icc):
     assert profile_curve(icc) is None
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
-def test_profiles_in_files(tmp_path: Path, suffix: str) -> None:
+def test_profiles_in_files(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     by = 'colour profile "Made up"'
     assert read_header(write(path, profile(curv(563)))).curve == StatedCurve(2.1992, by)
@@ -152,7 +147,7 @@ def test_profiles_in_files(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
-def test_a_huge_profile_counts_as_none(tmp_path: Path, suffix: str) -> None:
+def test_a_huge_profile_counts_as_none(tmp_path, suffix):
     path = write(tmp_path / f"a{suffix}", bytes(12 << 20))  # in a PNG, 12 kB that expand
     tracemalloc.start()
     assert read_header(path).curve.unread
@@ -160,7 +155,7 @@ def test_a_huge_profile_counts_as_none(tmp_path: Path, suffix: str) -> None:
     tracemalloc.stop()
 
 
-def test_many_parts_in_a_jpeg(tmp_path: Path) -> None:
+def test_many_parts_in_a_jpeg(tmp_path):
     part = b"\xff\xe2" + struct.pack(">H", 65_535) + b"ICC_PROFILE\0\1\1"
     (tmp_path / "a.jpg").write_bytes(b"\xff\xd8" + (part + bytes(65_535 - 16)) * 100)
     assert read_header(tmp_path / "a.jpg").curve == StatedCurve(None, "JPEG", unread=True)
@@ -175,7 +170,7 @@ def capture(folder: Path, icc: bytes | None, pixels: NDArray[Any], suffix: str) 
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_a_capture_is_read_with_the_curve_of_its_profile(tmp_path: Path, suffix: str) -> None:
+def test_a_capture_is_read_with_the_curve_of_its_profile(tmp_path, suffix):
     adobe = capture(tmp_path / "adobe", profile(curv(563), name="Adobe RGB (1998)"), PIXELS, suffix)
     found = read_capture(adobe)
     linear = read_capture(
@@ -185,7 +180,7 @@ def test_a_capture_is_read_with_the_curve_of_its_profile(tmp_path: Path, suffix:
     plain = read_capture(capture(tmp_path / "plain", None, PIXELS, suffix), as_stored=True)
     np.testing.assert_array_equal(linear.observations, plain.observations)
     expected = np.mean((PIXELS.reshape(-1, 3) / 65535) ** 2.1992, axis=1)
-    np.testing.assert_allclose(found.observations[:, 0], expected, rtol=1e-5)
+    assert_allclose(found.observations[:, 0], expected, rtol=1e-5)
     (told,) = [str(warning) for warning in found.warnings if warning.code == "display_decoded"]
     assert (
         '(colour profile "Adobe RGB (1998)") and are read as gamma:2.1992. Add --transfer linear'
@@ -193,7 +188,7 @@ def test_a_capture_is_read_with_the_curve_of_its_profile(tmp_path: Path, suffix:
     )
 
 
-def test_profiles_that_differ_or_cannot_be_read(tmp_path: Path) -> None:
+def test_profiles_that_differ_or_cannot_be_read(tmp_path):
     folder = capture(tmp_path / "a", SRGB_PROFILE, PIXELS, ".png")
     write(folder / "2.png", profile(curv(563)))
     source = open_capture(folder)
@@ -206,7 +201,7 @@ def test_profiles_that_differ_or_cannot_be_read(tmp_path: Path) -> None:
     )
 
 
-def test_profiles_are_read_by_others_too(tmp_path: Path) -> None:
+def test_profiles_are_read_by_others_too(tmp_path):
     """The files written here are what other programs take them for."""
     for suffix in (".png", ".jpg", ".tif"):
         path = write(
@@ -232,7 +227,7 @@ def test_decoding_turns_encoding_back():
         encode_srgb(decode_transfer((codes / 255).astype(np.float32), None)).tolist()
         == codes.tolist()
     )
-    np.testing.assert_allclose(decode_transfer(np.float32([0.25, 0.5]), 2.0), [0.0625, 0.25])
+    assert_allclose(decode_transfer(np.float32([0.25, 0.5]), 2.0), [0.0625, 0.25])
 
 
 def test_names_of_curves():

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
 from scenes import decode_rgb
@@ -64,7 +65,7 @@ def test_png_keeps_every_value(monkeypatch):
             0, np.iinfo(dtype).max, shape, dtype, endpoint=True
         )
         stored = cv2.imdecode(np.frombuffer(encode_png(picture), np.uint8), cv2.IMREAD_UNCHANGED)
-        np.testing.assert_array_equal(stored if picture.ndim == 2 else stored[..., ::-1], picture)
+        assert_array_equal(stored if picture.ndim == 2 else stored[..., ::-1], picture)
     monkeypatch.setattr(cv2, "imencode", lambda *_: (False, np.empty(0, np.uint8)))
     with pytest.raises(OutputError, match="cannot be encoded as PNG"):
         encode_png(np.zeros((2, 2), np.uint8))
@@ -75,7 +76,7 @@ VIOLET, TEAL, YELLOW = (68, 1, 84), (33, 145, 140), (253, 231, 37)
 WHITE = (255, 255, 255)
 
 
-def test_known_errors_have_known_colours() -> None:
+def test_known_errors_have_known_colours():
     errors = np.array([[0, 15, 30, 180, np.nan]], np.float32)
     colours = colour_errors(errors).astype(int)
     wanted = np.array([[VIOLET, TEAL, YELLOW, YELLOW, WHITE]])
@@ -83,22 +84,22 @@ def test_known_errors_have_known_colours() -> None:
     assert (colours[0, 4] == 255).all()
 
 
-def test_a_small_map_is_enlarged_pixel_by_pixel_and_a_large_one_keeps_its_pixels() -> None:
+def test_a_small_map_is_enlarged_pixel_by_pixel_and_a_large_one_keeps_its_pixels():
     errors = np.full((60, 50), np.nan, np.float32)
     errors[10:20, 30:40] = 30
     picture = error_map_picture(errors)
     assert picture.dtype == np.uint8 and picture.shape[0] == 300
     square = np.zeros((300, 250), bool)
     square[50:100, 150:200] = True
-    np.testing.assert_array_equal((picture[:, :250] != 255).any(axis=2), square)
+    assert_array_equal((picture[:, :250] != 255).any(axis=2), square)
     errors = np.random.default_rng(0).uniform(0, 60, (400, 300)).astype(np.float32)
     picture = error_map_picture(errors)
     assert picture.shape[0] == 400
-    np.testing.assert_array_equal(picture[:, :300], colour_errors(errors))
+    assert_array_equal(picture[:, :300], colour_errors(errors))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (10, 2000), (2000, 10), (256, 256)])
-def test_the_bar_runs_from_0_to_the_top(shape: tuple[int, int]) -> None:
+def test_the_bar_runs_from_0_to_the_top(shape):
     picture = error_map_picture(np.full(shape, np.nan, np.float32))
     assert picture.shape[0] == max(shape[0], 256)
     coloured = np.ptp(picture.astype(int), axis=2) > 0  # the map is white and the text is gray
@@ -106,9 +107,7 @@ def test_the_bar_runs_from_0_to_the_top(shape: tuple[int, int]) -> None:
     bar = picture[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     assert len(bar) > 200
     assert bar.shape[1] >= 18
-    np.testing.assert_array_equal(
-        bar[:, 0], colour_errors(np.linspace(TOP_DEG, 0, len(bar))[:, None])[:, 0]
-    )
+    assert_array_equal(bar[:, 0], colour_errors(np.linspace(TOP_DEG, 0, len(bar))[:, None])[:, 0])
     # Text: black ink right of the bar, and none cut at the picture's edges.
     right = picture[:, columns[-1] + 1 :]
     assert (right < 64).all(axis=2).sum() > 200
@@ -135,7 +134,7 @@ def lines(axes: Any) -> dict[str, list[list[float]]]:
     }
 
 
-def test_each_curve_leaves_out_what_was_not_computed() -> None:
+def test_each_curve_leaves_out_what_was_not_computed():
     loss, angle, maps = training_figure(COLUMNS).axes
     steps = [50, 100, 125]
     assert lines(loss) == {
@@ -152,7 +151,7 @@ def test_each_curve_leaves_out_what_was_not_computed() -> None:
     assert loss.get_yscale() == "linear"
 
 
-def test_scales_and_hidden_axes() -> None:
+def test_scales_and_hidden_axes():
     """Wide curves are logarithmic unless a value is zero; without a LI-Net, the map errors are
     hidden.
     """
@@ -168,7 +167,7 @@ LIGHTS = np.array([(0, 0, 1), (0.6, 0, 0.8)])
 
 
 @pytest.mark.parametrize("name", ["b\udcff", "a\nb\x1b[2J", r"$\frac$"])
-def test_a_name_that_is_not_printable_or_a_formula(name: str) -> None:
+def test_a_name_that_is_not_printable_or_a_formula(name):
     assert sky_plot(LIGHTS, name) != sky_plot(LIGHTS, "")
 
 
@@ -209,7 +208,7 @@ def error_colour(error_deg: float) -> tuple[int, ...]:
 
 @pytest.mark.parametrize("n_methods", [1, 2, 9])
 @pytest.mark.parametrize(("height", "width"), [(10, 10), (300, 200), (40, 120), (120, 40)])
-def test_colours_stand_where_they_belong(height: int, width: int, n_methods: int) -> None:
+def test_colours_stand_where_they_belong(height, width, n_methods):
     picture = draw(height, width, [f"method {i}" for i in range(n_methods)])
     [truth] = places_of(BLUE, picture)
     normals, errors = places_of(TILTED, picture), places_of(error_colour(12), picture)
@@ -226,7 +225,7 @@ def test_colours_stand_where_they_belong(height: int, width: int, n_methods: int
     assert errors[0][0] >= truth[0] + truth[2]
 
 
-def test_the_frame_is_not_turned() -> None:
+def test_the_frame_is_not_turned():
     mask = np.ones((100, 100), bool)
     truth = np.zeros((100, 100, 3))
     truth[:50], truth[50:] = (0, 0, 1), unit(np.array([1.0, 0.0, 1.0]))
@@ -239,13 +238,13 @@ def test_the_frame_is_not_turned() -> None:
     assert left[0][1] + left[0][3] == right[0][1]
 
 
-def test_nothing_is_cut_at_the_edges_and_the_bar_runs_over_the_whole_scale() -> None:
+def test_nothing_is_cut_at_the_edges_and_the_bar_runs_over_the_whole_scale():
     picture = draw(300, 300, ["ls"])
     for error_deg in (0.0, TOP_DEG / 2, TOP_DEG):
         assert (picture == error_colour(error_deg)).all(axis=2).sum() >= 10
     long = (
-        "a capture with quite a long name, 10 lights, draw 1 of 10, seed 0, light noise of 2"
-        " degrees $x$"
+        "a capture with quite a long name, 10 lights, draw 1 of 10, seed 0, light noise of 2 "
+        "degrees $x$"
     )
     for methods in (["ls"], ["a method with a long name", "b"]):
         picture = draw(20, 30, methods, title=long)
@@ -279,7 +278,7 @@ def draw_cells(
         pixels=np.array([[12, 34]] * n_pixels) if named else None,
         error_deg=np.full(n_pixels, 3.25),
         title="$cat$, 10 lights" if named else "",
-        grid=grid,  # type: ignore[arg-type]
+        grid=grid,
     )
     return decode_rgb(png)
 
@@ -292,7 +291,7 @@ def boxes(picture: NDArray[np.uint8], colour: tuple[int, int, int]) -> list[NDAr
 
 
 @pytest.mark.parametrize("n_pixels", [1, 4])
-def test_cells_stand_where_they_are(n_pixels: int) -> None:
+def test_cells_stand_where_they_are(n_pixels):
     picture = draw_cells(n_pixels)
     # Frames around a map, from its empty corner beside the circle.
     dense = [box for box in boxes(picture, CELL_VIOLET) if min(box[2:]) > 100]
@@ -304,14 +303,14 @@ def test_cells_stand_where_they_are(n_pixels: int) -> None:
         assert cell[0] < whole[0]  # the sparse map is left of the dense one
 
 
-def test_empty_cells_are_gray_and_the_truth_may_be_missing() -> None:
+def test_empty_cells_are_gray_and_the_truth_may_be_missing():
     with_truth, without = draw_cells(2), draw_cells(2, with_truth=False)
     assert with_truth.shape[1] > without.shape[1]
     gray = [(np.abs(p.astype(int) - GRAY).max(axis=2) <= 1).sum() for p in (with_truth, without)]
     assert gray[0] > 1.8 * gray[1]
 
 
-def test_a_training_run_leaves_out_the_title_and_the_places_and_perhaps_the_dense_map() -> None:
+def test_a_training_run_leaves_out_the_title_and_the_places_and_perhaps_the_dense_map():
     whole, unnamed, without = (
         draw_cells(2),
         draw_cells(2, named=False),

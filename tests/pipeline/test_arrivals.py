@@ -1,5 +1,6 @@
 """Captures that arrive in a folder: when each is complete, and that it is returned once."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ def put(path: Path, content: str = "image") -> None:
     path.write_text(content)
 
 
-def test_a_capture_is_complete_when_nothing_changes_for_some_time(tmp_path: Path) -> None:
+def test_a_capture_is_complete_when_nothing_changes_for_some_time(tmp_path):
     clock = Clock()
     arrivals = Arrivals(
         tmp_path, marker=None, seconds=5, without=tmp_path / "out/results", clock=clock
@@ -50,14 +51,12 @@ def test_a_capture_is_complete_when_nothing_changes_for_some_time(tmp_path: Path
     assert arrivals.take() == [tmp_path / "part10"]
 
 
-def test_the_files_of_a_capture_that_is_done_are_left_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_files_of_a_capture_that_is_done_are_left_alone(tmp_path, monkeypatch):
     """A folder of a thousand captures would be read again each second."""
     clock, walked = Clock(), list[Path]()
     arrivals = Arrivals(tmp_path, marker=None, seconds=0, without=tmp_path / "out", clock=clock)
-    walk = incoming._stamp
-    monkeypatch.setattr(incoming, "_stamp", lambda capture: walked.append(capture) or walk(capture))
+    walk = os.walk
+    monkeypatch.setattr(os, "walk", lambda capture: walked.append(capture) or walk(capture))
     done, other = tmp_path / "done", tmp_path / "other"
     put(done / "images/1.png")
     put(other / "1.png")
@@ -71,9 +70,7 @@ def test_the_files_of_a_capture_that_is_done_are_left_alone(
     assert arrivals.take() == [done]
 
 
-def test_two_at_once_come_in_natural_order_and_one_that_vanishes_is_forgotten(
-    tmp_path: Path,
-) -> None:
+def test_two_at_once_come_in_natural_order_and_one_that_vanishes_is_forgotten(tmp_path):
     arrivals = Arrivals(tmp_path, marker=None, seconds=0, without=tmp_path / "out")
     put(tmp_path / "part10/1.png")
     put(tmp_path / "part9/1.png")
@@ -85,7 +82,7 @@ def test_two_at_once_come_in_natural_order_and_one_that_vanishes_is_forgotten(
     assert arrivals.take() == [tmp_path / "part9"]
 
 
-def test_a_marker_needs_no_time(tmp_path: Path) -> None:
+def test_a_marker_needs_no_time(tmp_path):
     arrivals = Arrivals(tmp_path, marker="done", seconds=5, without=tmp_path / "out", clock=Clock())
     put(tmp_path / "part/1.png")
     assert arrivals.take() == []
@@ -94,7 +91,7 @@ def test_a_marker_needs_no_time(tmp_path: Path) -> None:
     assert arrivals.take() == []
 
 
-def test_films_are_complete_when_they_no_longer_change(tmp_path: Path) -> None:
+def test_films_are_complete_when_they_no_longer_change(tmp_path):
     clock = Clock()
     arrivals = Arrivals(tmp_path, marker="done", seconds=5, without=tmp_path / "out", clock=clock)
     for name in ("clip.mp4", "clip/done", "other.MOV", ".hidden.mp4", "notes.txt"):
@@ -109,7 +106,7 @@ def test_films_are_complete_when_they_no_longer_change(tmp_path: Path) -> None:
     assert arrivals.take() == []
 
 
-def test_captures_of_one_name_come_one_after_the_other(tmp_path: Path) -> None:
+def test_captures_of_one_name_come_one_after_the_other(tmp_path):
     """Together they would end the batch."""
     arrivals = Arrivals(tmp_path, marker=None, seconds=0, without=tmp_path / "out")
     for name in ("clip.mp4", "clip/1.png"):
@@ -118,7 +115,7 @@ def test_captures_of_one_name_come_one_after_the_other(tmp_path: Path) -> None:
     assert [len(paths) for paths in found] == [1, 1, 0] and found[0] != found[1]
 
 
-def test_a_folder_that_vanishes_for_a_moment(tmp_path: Path) -> None:
+def test_a_folder_that_vanishes_for_a_moment(tmp_path):
     arrivals = Arrivals(tmp_path / "parts", marker=None, seconds=0, without=tmp_path / "out")
     put(tmp_path / "parts/a/1.png")
     assert arrivals.take() == [tmp_path / "parts/a"]
@@ -129,6 +126,6 @@ def test_a_folder_that_vanishes_for_a_moment(tmp_path: Path) -> None:
     assert arrivals.take() == [tmp_path / "parts/a"]
 
 
-def test_a_folder_that_cannot_be_read(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match="the folder cannot be read"):
         Arrivals(tmp_path / "nowhere", marker=None, seconds=0, without=tmp_path).take()

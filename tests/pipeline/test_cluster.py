@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import worker_tasks
-from scenes import write_capture
+from scenes import read_json, write_capture
 from splinecli.cli.main import main
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
 from splinecli.maths.normals import unit
@@ -174,12 +174,12 @@ def test_a_cluster_gives_what_one_process_gives(cluster, tmp_path, monkeypatch, 
     names = [*write_captures(["b", "broken", "a", "c", "d"]), "missing"]
     call = ["infer", *names, "--maps", "albedo", "--method", "ls"]
 
-    def documents(*more: str) -> list[dict[str, Any]]:
+    def documents(*more):
         assert main([*call, *more, "--jsonl"]) == 3
         lines = capfd.readouterr().out.splitlines()
         return sorted(map(json.loads, lines), key=lambda document: document["capture"])
 
-    def comparable(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    def comparable(found):
         return [{**document, "seconds": None, "peak_memory_mib": None} for document in found]
 
     alone = documents("-o", "out")
@@ -281,9 +281,9 @@ def test_trials_on_workers(cluster, tmp_path, monkeypatch, capfd):
         "all",
     ]
 
-    def results(output: str, *more: str) -> Any:
+    def results(output, *more):
         assert main([*call, "-o", output, *more]) == 3
-        document = json.loads(Path(output, "results.json").read_text())
+        document = read_json(Path(output, "results.json"))
         text = re.sub(r'"seconds[a-z_]*": [0-9.e-]+', "", json.dumps(document))
         return text, capfd.readouterr().err, Path(output, "trials.jsonl").read_text().count("\n")
 

@@ -14,8 +14,8 @@ from splinecli.errors import UsageError
 from splinecli.estimate.methods.estimator import LeastSquares, StudentSize
 from splinecli.estimate.refinement.refiner import MARGIN, TILE
 from splinecli.pipeline import infer
-from splinecli.pipeline.expected_seconds import expected_seconds
-from splinecli.pipeline.infer import AUTOMATIC_FROM, REFINED_PIXELS, distil_for
+from splinecli.pipeline.expected_seconds import AUTOMATIC_FROM, expected_seconds
+from splinecli.pipeline.infer import REFINED_PIXELS, distil_for
 from splinecli.pipeline.info import ORIGINS
 from splinecli.records.output_files import MAPS
 from splinecli.records.white_level import Origin
@@ -23,7 +23,7 @@ from splinecli.records.white_level import Origin
 LIGHTS = spiral_lights(6, 40)
 
 
-def test_alignment_and_maps_are_expected_to_take_time() -> None:
+def test_alignment_and_maps_are_expected_to_take_time():
     images = (12_000, 10_000_000)  # 12,000 pixels in the mask of ten images of a megapixel
     plain, aligned, material = (
         sum(expected_seconds(*images, **options).values())
@@ -55,14 +55,14 @@ def capture(count: int) -> Capture:
     return Capture("matte", observations, LIGHTS, tuple(range(6)), np.ones((1, count), bool))
 
 
-def test_small_captures_and_exact_ones_are_not_distilled() -> None:
+def test_small_captures_and_exact_ones_are_not_distilled():
     teacher = Slow()
     assert distil_for(capture(3000), teacher, None) == (None, [])
     assert distil_for(capture(AUTOMATIC_FROM), teacher, False) == (None, [])
     assert teacher.asked == 0
 
 
-def test_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wanted(monkeypatch):
     monkeypatch.setattr(infer, "student_sizes", lambda _: (StudentSize(750, 50, 16),) * 2)
     teacher = Slow()
     found, warnings = distil_for(capture(3000), teacher, True)
@@ -78,7 +78,7 @@ def test_the_size_decides_about_large_captures_not_the_speed(monkeypatch, second
     assert found is not None and warnings == []
 
 
-def test_what_cannot_be_learned_is_left_to_the_network(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_learned_is_left_to_the_network(monkeypatch):
     sizes = StudentSize(500, 50, 16), StudentSize(900, 50, 16)
     monkeypatch.setattr(infer, "student_sizes", lambda _: sizes)
     teacher = Slow(random=True)
@@ -90,7 +90,7 @@ def test_what_cannot_be_learned_is_left_to_the_network(monkeypatch: pytest.Monke
     assert teacher.asked == 500 + 900  # both sizes were tried
 
 
-def test_refused() -> None:
+def test_refused():
     for few, estimator, problem in (
         (
             capture(3000),
@@ -104,7 +104,7 @@ def test_refused() -> None:
         assert distil_for(few, estimator, None) == (None, [])
 
 
-def test_a_large_capture_with_few_lit_pixels_is_left_to_the_network() -> None:
+def test_a_large_capture_with_few_lit_pixels_is_left_to_the_network():
     """Without a mask, most pixels are a black background."""
     dark = capture(AUTOMATIC_FROM)
     dark.observations[100:] = 0
@@ -113,9 +113,9 @@ def test_a_large_capture_with_few_lit_pixels_is_left_to_the_network() -> None:
     assert distil_for(dark, Slow(), None) == (None, [])
 
 
-def test_the_most_refined_pixels_are_a_tile_with_its_margin() -> None:
+def test_the_most_refined_pixels_are_a_tile_with_its_margin():
     assert REFINED_PIXELS == (TILE + 2 * MARGIN) ** 2
 
 
-def test_every_origin_of_a_white_level_has_words() -> None:
+def test_every_origin_of_a_white_level_has_words():
     assert ORIGINS.keys() == set(get_args(Origin))

@@ -7,15 +7,27 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
 import splinecli
-from scenes import BUMP_LAMPS, evaluate, shade, sphere, spiral_lights, write_bump, write_capture
+from scenes import (
+    BUMP_LAMPS,
+    Floats,
+    evaluate,
+    read_image,
+    shade,
+    sphere,
+    spiral_lights,
+    to_uint16,
+    write_bump,
+    write_capture,
+)
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.evaluation.protocol import Protocol
 from splinecli.maths.normals import angle_between_deg
 from splinecli.pipeline.infer import infer_capture
-from splinecli.pipeline.infer_options import InferOptions, InfoOptions, Reading
+from splinecli.pipeline.infer_options import InferOptions, InfoOptions, ReadingOptions
 from splinecli.pipeline.info import describe_capture
 
 Images = NDArray[np.uint16]
@@ -25,7 +37,7 @@ WHITE, TUNGSTEN = (1.0, 1.0, 1.0), (1.0, 0.75, 0.5)
 LAMPS = np.tile([WHITE, TUNGSTEN], (6, 1))
 
 
-def paint(*colours: tuple[float, float, float]) -> NDArray[np.float64]:
+def paint(*colours: tuple[float, float, float]) -> Floats:
     """Stripes (H, W, 3) of these colours, with some texture."""
     stripes = np.array(colours)[np.arange(64) // 8 % len(colours)]
     grain = np.random.default_rng(1).uniform(0.8, 1, (64, 64, 1))
@@ -37,19 +49,17 @@ STRONG = paint((0.9, 0.2, 0.1), (0.1, 0.3, 0.9))
 GRAY = paint(WHITE)
 
 
-def photograph(
-    albedo: NDArray[np.float64], lamps: NDArray[np.float64] | None = None, gloss: float = 0.0
-) -> Images:
+def photograph(albedo: Floats, lamps: Floats | None = None, gloss: float = 0.0) -> Images:
     """Return 16-bit images (F, H, W, 3) of the ball, of which the brightest value is at 60,000."""
     lamps = np.ones((12, 3)) if lamps is None else lamps
     shading = np.where(MASK[..., None], shade(NORMALS, LIGHTS, gloss=gloss), 0)
     images = np.einsum("hwf,hwc,fc->fhwc", shading, albedo, lamps)
-    return np.rint(images / images.max() * 60_000).astype(np.uint16)
+    return to_uint16(images / images.max() * 60_000)
 
 
 def write(folder: Path, images: NDArray[np.generic], **more: NDArray[np.generic] | None) -> Path:
     given = {"mask": MASK, "normals": NORMALS.astype(np.float32), **more}
-    return write_capture(folder, images, LIGHTS, **given)  # type: ignore[arg-type]
+    return write_capture(folder, images, LIGHTS, **given)
 
 
 def moved(images: Images) -> Images:
@@ -112,13 +122,13 @@ def reading_of(name: str) -> dict[str, object]:
 
 @pytest.mark.parametrize("auto_mask", [False, True], ids=["", "auto-mask"])
 @pytest.mark.parametrize("name", [*STILL, *OTHERS])
-def test_infer_and_info_give_the_same_warnings(tmp_path: Path, name: str, auto_mask: bool) -> None:
+def test_infer_and_info_give_the_same_warnings(tmp_path, name, auto_mask):
     folder = (STILL | OTHERS)[name](tmp_path / "capture")
     options = InferOptions(
         method="ls", output=str(tmp_path), auto_mask=auto_mask, **reading_of(name)
     )
     report = infer_capture(folder, options)
-    reading = Reading(**reading_of(name))
+    reading = ReadingOptions(**reading_of(name))
     info = describe_capture(InfoOptions(capture=folder, auto_mask=auto_mask), reading)
     assert info["warnings"] == [warning["text"] for warning in report["warnings"]]
     assert info["warning_codes"] == [warning["code"] for warning in report["warnings"]]
@@ -126,7 +136,7 @@ def test_infer_and_info_give_the_same_warnings(tmp_path: Path, name: str, auto_m
 
 
 @pytest.mark.parametrize("name", [*STILL, *OTHERS])
-def test_infer_and_evaluate_give_the_same_error(tmp_path: Path, name: str) -> None:
+def test_infer_and_evaluate_give_the_same_error(tmp_path, name):
     if reading_of(name):
         pytest.skip("evaluate has no options of reading")
     folder = (STILL | OTHERS)[name](tmp_path / "capture")
@@ -138,11 +148,11 @@ def test_infer_and_evaluate_give_the_same_error(tmp_path: Path, name: str) -> No
 
 
 @pytest.mark.parametrize("name", [name for name in STILL if name not in ("8 bits", "near lamps")])
-def test_files_and_arrays_give_the_same_normals(tmp_path: Path, name: str) -> None:
+def test_files_and_arrays_give_the_same_normals(tmp_path, name):
     folder = STILL[name](tmp_path / "capture")
     infer_capture(folder, InferOptions(method="ls", output=str(tmp_path)))
     paths = sorted(folder.glob("[0-9]*.png"))
-    images = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in paths]
+    images = [read_image(path) for path in paths]
     stack = np.stack([image if image.ndim == 2 else image[..., ::-1] for image in images])
     known = LAMPS if name == "RGB intensities" else None
     mask = None if name == "without mask" else MASK
@@ -153,11 +163,11 @@ def test_files_and_arrays_give_the_same_normals(tmp_path: Path, name: str) -> No
             stack, lights, mask, light_intensities=known, method="ls"
         )
     normals = np.load(tmp_path / "capture" / "normals.npy")
-    np.testing.assert_array_equal(estimate.normal_map, normals)
+    assert_array_equal(estimate.normal_map, normals)
 
 
 @pytest.mark.parametrize("name", ["plain", "coloured lamps", "strongly coloured object", "blurred"])
-def test_aligning_a_still_capture_changes_nothing(tmp_path: Path, name: str) -> None:
+def test_aligning_a_still_capture_changes_nothing(tmp_path, name):
     folder = STILL[name](tmp_path / "capture")
     found, warned = [], []
     for align in (False, True):
@@ -166,10 +176,10 @@ def test_aligning_a_still_capture_changes_nothing(tmp_path: Path, name: str) -> 
         warned.append(report["warnings"])
         found.append(np.load(tmp_path / "capture" / "normals.npy"))
     assert warned[0] == warned[1]
-    np.testing.assert_array_equal(*found)
+    assert_array_equal(*found)
 
 
-def test_coloured_lamps_leave_nothing_but_their_warning(tmp_path: Path) -> None:
+def test_coloured_lamps_leave_nothing_but_their_warning(tmp_path):
     """The pixels near the middle have no attached shadows, so least squares is exact there."""
     folder = STILL["strongly coloured object"](tmp_path / "capture")
     inside = cv2.circle(np.zeros((64, 64), np.uint8), (32, 32), 17, 1, cv2.FILLED) > 0

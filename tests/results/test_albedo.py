@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scenes import square_grid, write_capture
+from scenes import read_image, square_grid, to_uint16, write_capture, write_image
 from splinecli.capture import open_capture
 from splinecli.lights.calibration.balls import find_ball_files
 from splinecli.lights.calibration.lamps import measure_light_intensities
@@ -40,7 +40,7 @@ def scene(tmp_path: Path):
     for number, image in enumerate(images):
         image[number::12] *= 0.1  # cast shadow on every twelfth row
         image[:, number::12] += 0.2  # highlights on every twelfth column
-    stored = np.rint((images * INTENSITIES[:, None, None]).clip(0, 1) * 65535).astype(np.uint16)
+    stored = to_uint16((images * INTENSITIES[:, None, None]).clip(0, 1) * 65535)
     write_capture(tmp_path, stored, LIGHTS, mask=inside, intensities=INTENSITIES, names="{}.png")
     return tmp_path, normals, albedo
 
@@ -54,11 +54,9 @@ def test_a_gray_target_balances_the_colours(scene, tmp_path):
     tint = INTENSITIES * (1, 0.7, 0.4)
     for number, (light, colour) in enumerate(zip(LIGHTS, tint, strict=True)):
         card = np.broadcast_to(0.5 * light[2] * colour * 65535, (20, 20, 3))
-        cv2.imwrite(
-            str(tmp_path / f"card/{number}.png"), np.rint(card[..., ::-1]).astype(np.uint16)
-        )
+        cv2.imwrite(str(tmp_path / f"card/{number}.png"), to_uint16(card[..., ::-1]))
         gray = 0.4 * (normals @ light).clip(0)[..., None] * colour * 65535
-        cv2.imwrite(str(folder / f"{number}.png"), np.rint(gray[..., ::-1]).astype(np.uint16))
+        write_image(folder / f"{number}.png", to_uint16(gray[..., ::-1]))
     measured = measure_light_intensities(find_ball_files(tmp_path / "card"), LIGHTS, "card")
     np.savetxt(folder / "light_intensities.txt", measured)
     source = open_capture(folder)
@@ -74,8 +72,8 @@ def test_restored_pixels_do_not_spoil_it(scene):
     """
     folder, normals, albedo = scene
     for path in folder.glob("[0-9].png"):
-        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.int64)
-        cv2.imwrite(str(path), np.minimum(2.5 * picture, 65_535).astype(np.uint16))
+        picture = read_image(path).astype(np.int64)
+        write_image(path, np.minimum(2.5 * picture, 65_535).astype(np.uint16))
     source = open_capture(folder)
     capture = prepare_capture(source)
     stored = prepare_capture(source, options=RecipeOptions(as_stored=True)).observations

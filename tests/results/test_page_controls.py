@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
-from browser import OpenPage
 from html_page import REPORT, SIDE, ball, light_at
 from splinecli.results import pages as page_module
 from splinecli.results.pages import result_page
@@ -19,13 +19,11 @@ def wait_until(page: Any, condition: str) -> None:
 
 
 def lights_are(page: Any, x: float, y: float, note: str) -> None:
-    np.testing.assert_allclose(
-        page.evaluate("splinecli.light"), light_at(x, y), atol=0.02, err_msg=note
-    )
+    assert_allclose(page.evaluate("splinecli.light"), light_at(x, y), atol=0.02, err_msg=note)
 
 
 @pytest.mark.parametrize("webgl", [True, False])
-def test_mouse_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> None:
+def test_mouse_keys_and_a_narrow_screen(open_page, webgl):
     normals, mask = ball()
     report = {**REPORT, "capture": "x" * 300, "warnings": [{"code": "", "text": "y" * 300}]}
     values = {"albedo": normals + 1, "confidence": mask.astype(np.float32)}
@@ -45,7 +43,7 @@ def test_mouse_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> Non
     box = canvas.bounding_box()
     radius = box["width"] / 2
 
-    def at(x: float, y: float) -> tuple[float, float]:
+    def at(x, y):
         return box["x"] + radius * (1 + x), box["y"] + radius * (1 - y)
 
     page.mouse.move(*at(0, 0))
@@ -68,20 +66,18 @@ def test_mouse_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> Non
     page.mouse.wheel(0, -300)
     wait_until(page, "splinecli.region[2] < 200")
     left, top, width, height = page.evaluate("splinecli.region")
-    np.testing.assert_allclose((left, top, width, height), (32, 64, 128, 128), atol=1)
+    assert_allclose((left, top, width, height), (32, 64, 128, 128), atol=1)
     # The picture follows the drag, an eighth of the view to the left and a quarter up; the light
     # stays.
     page.mouse.down()
     page.mouse.move(*at(-0.75, 0.5), steps=3)
     page.mouse.up()
-    np.testing.assert_allclose(
-        page.evaluate("splinecli.region"), (32 + 16, 64 + 32, 128, 128), atol=2
-    )
+    assert_allclose(page.evaluate("splinecli.region"), (32 + 16, 64 + 32, 128, 128), atol=2)
     lights_are(page, 0.3, 0.3, "dragged")
     page.keyboard.press("Shift+ArrowLeft")
-    np.testing.assert_allclose(page.evaluate("splinecli.region")[0], 48 - 12.8, atol=2)
+    assert_allclose(page.evaluate("splinecli.region")[0], 48 - 12.8, atol=2)
     page.keyboard.press("+")
-    np.testing.assert_allclose(page.evaluate("splinecli.region")[2], 128 / 1.25, atol=1)
+    assert_allclose(page.evaluate("splinecli.region")[2], 128 / 1.25, atol=1)
     page.keyboard.press("0")
     assert page.evaluate("splinecli.region") == [0, 0, SIDE, SIDE]
     page.evaluate("splinecli.show(1e9, -50, 1e9)")
@@ -92,7 +88,7 @@ def test_mouse_keys_and_a_narrow_screen(open_page: OpenPage, webgl: bool) -> Non
 TOUCH = "Input.dispatchTouchEvent"
 
 
-def test_fingers(open_page: OpenPage) -> None:
+def test_fingers(open_page):
     """One finger moves the light, two move and zoom the picture about what they touch."""
     page = open_page(result_page(REPORT, *ball()), width=400, height=800)
     page.evaluate("splinecli.ready")
@@ -101,7 +97,7 @@ def test_fingers(open_page: OpenPage) -> None:
     client = page.context.new_cdp_session(page)
     client.send("Emulation.setTouchEmulationEnabled", {"enabled": True, "maxTouchPoints": 2})
 
-    def touch(kind: str, *shares: tuple[float, float]) -> None:
+    def touch(kind, *shares):
         points = [
             {"x": box["x"] + x * box["width"], "y": box["y"] + y * box["height"], "id": number}
             for number, (x, y) in enumerate(shares)
@@ -120,7 +116,7 @@ def test_fingers(open_page: OpenPage) -> None:
     assert page.evaluate("splinecli.light") == lights
     # The fingers are twice as far apart, and what was between them, the middle, is a tenth of the
     # view higher.
-    np.testing.assert_allclose(page.evaluate("splinecli.region"), (64, 76.8, 128, 128), atol=2)
+    assert_allclose(page.evaluate("splinecli.region"), (64, 76.8, 128, 128), atol=2)
     touch("touchEnd")
 
 

@@ -4,16 +4,17 @@ import re
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label
 
+from scenes import Floats
 from splinecli.errors import InputError, UsageError
 from splinecli.maths.normals import unit
 from splinecli.surface import integration
 from splinecli.surface.bilateral_equations import CONTRADICTION
 from splinecli.surface.integration import integrate_normals, relief_of_normals
 
-Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 CAMERA = np.array([[210.0, 0.0, 63.0], [0.0, 200.0, 41.0], [0.0, 0.0, 1.0]])
 # Maps of more pixels than this start from coarser ones.
@@ -85,7 +86,7 @@ def error_share(found: Floats, truth: Floats, mask: Mask) -> float:
 @pytest.mark.usefixtures("any_scale")
 @pytest.mark.parametrize("discontinuity", [0, 2])
 @pytest.mark.parametrize(("reach", "limit"), [(0.6, 1e-4), (0.9, 2e-4), (1.0, 1e-3)])
-def test_sphere(reach: float, limit: float, discontinuity: float) -> None:
+def test_sphere(reach, limit, discontinuity):
     # Up to the rim, where normals are grazing, the last pixel is off by more.
     normals, mask, truth = sphere(130, 150, 60, reach)
     found = integrate_normals(normals, mask, discontinuity=discontinuity)
@@ -116,7 +117,7 @@ def levels(
 
 @pytest.mark.parametrize("joined", [30, 70])
 @pytest.mark.parametrize("coarse_from", [10**9, 3000])
-def test_levels_apart(monkeypatch: pytest.MonkeyPatch, coarse_from: int, joined: int) -> None:
+def test_levels_apart(monkeypatch, coarse_from, joined):
     monkeypatch.setattr(integration, "_COARSEST", coarse_from)
     normals, truth, wall = levels(100, 120, 30, 2, joined)
     everywhere = np.ones(wall.shape, bool)
@@ -132,14 +133,14 @@ def test_levels_apart(monkeypatch: pytest.MonkeyPatch, coarse_from: int, joined:
 
 @pytest.mark.parametrize("slopes", [(-3.0, 1.0), (12.0, 8.0)])
 @pytest.mark.parametrize("shape", [(30, 50), (1, 40), (2, 2)])
-def test_plane_is_exact(shape: tuple[int, int], slopes: tuple[float, float]) -> None:
+def test_plane_is_exact(shape, slopes):
     x, y = grid(*shape)
     mask = np.ones(shape, bool)
     normals = normals_of_slopes(slopes[0] + 0 * x, slopes[1] + 0 * x)
     # As float32 slopes of s have errors of s^2 * 1e-7, over 90 pixels.
     for dtype, atol in ((np.float32, 3e-3), (np.float64, 1e-4)):
         found = integrate_normals(normals.astype(dtype), mask)
-        np.testing.assert_allclose(found, slopes[0] * x + slopes[1] * y, atol=atol, rtol=0)
+        assert_allclose(found, slopes[0] * x + slopes[1] * y, atol=atol, rtol=0)
 
 
 def seen(camera: Floats, height: int, width: int) -> Floats:
@@ -152,7 +153,7 @@ def seen(camera: Floats, height: int, width: int) -> Floats:
 
 
 @pytest.mark.usefixtures("any_scale")
-def test_perspective_plane() -> None:
+def test_perspective_plane():
     rays, mask = seen(CAMERA, 90, 120), np.ones((90, 120), bool)
     normal = unit(np.array([0.3, -0.4, 0.8]))
     depth = -1 / (rays @ normal)
@@ -161,15 +162,15 @@ def test_perspective_plane() -> None:
     found = integrate_normals(normals, mask, camera_matrix=CAMERA)
     # A step of log(depth) is not quite linear in its slope.
     assert error_share(found, depth, mask) < 5e-4
-    np.testing.assert_allclose(found, depth, rtol=1e-3)
+    assert_allclose(found, depth, rtol=1e-3)
     # A prior gives depths their scale.
-    np.testing.assert_allclose(
+    assert_allclose(
         integrate_normals(normals, mask, CAMERA, prior=500 * depth), 500 * depth, rtol=1e-3
     )
 
 
 @pytest.mark.usefixtures("any_scale")
-def test_perspective_sphere() -> None:
+def test_perspective_sphere():
     rays = seen(CAMERA, 90, 120)
     centre, radius = np.array([0.1, -0.05, -6.0]), 1.1
     # |t r - c| = R, the nearer of the two.
@@ -229,13 +230,13 @@ def dense(normals: Floats, mask: Mask, discontinuity: float, iterations: int) ->
     return heights
 
 
-def test_least_squares_is_the_dense_solution() -> None:
+def test_least_squares_is_the_dense_solution():
     normals, mask = bumps(14, 19, usable=True), holes(14, 19)
     found = integrate_normals(normals, mask, discontinuity=0)[mask]
-    np.testing.assert_allclose(found, dense(normals, mask, 0, 1), atol=1e-4)
+    assert_allclose(found, dense(normals, mask, 0, 1), atol=1e-4)
 
 
-def test_a_prior_is_the_dense_solution() -> None:
+def test_a_prior_is_the_dense_solution():
     normals, mask = bumps(14, 19, usable=True), holes(14, 19)
     prior = np.random.default_rng(2).normal(size=mask.shape)
     prior[:, 12:] = np.nan  # parts there have mean height 0, in relation to the mean of the prior
@@ -250,9 +251,9 @@ def test_a_prior_is_the_dense_solution() -> None:
     expected = np.linalg.lstsq(rows, values)[0]
     parts = label(mask)[0][mask]
     reached = np.isin(parts, parts[known])
-    np.testing.assert_allclose(found[reached], expected[reached], atol=1e-4)
+    assert_allclose(found[reached], expected[reached], atol=1e-4)
     means = [found[parts == part].mean() for part in np.unique(parts[~reached])]
-    np.testing.assert_allclose(means, prior[mask][known].mean(), atol=1e-9)
+    assert_allclose(means, prior[mask][known].mean(), atol=1e-9)
 
 
 def drifting(seed: int = 0) -> tuple[Floats, Floats, Floats]:
@@ -274,11 +275,11 @@ def drifting(seed: int = 0) -> tuple[Floats, Floats, Floats]:
 
 @pytest.mark.parametrize("discontinuity", [0.0, 2.0])
 @pytest.mark.usefixtures("any_scale")
-def test_a_prior_is_better_than_normals_and_scan_alone(discontinuity: float) -> None:
+def test_a_prior_is_better_than_normals_and_scan_alone(discontinuity):
     normals, heights, scan = drifting()
     scan[80:95, 60:120] = np.nan
 
-    def error(found: Floats) -> float:
+    def error(found):
         return float(np.nanstd(found - heights))
 
     both = integrate_normals(normals, discontinuity=discontinuity, prior=scan)
@@ -290,7 +291,7 @@ def test_a_prior_is_better_than_normals_and_scan_alone(discontinuity: float) -> 
     assert abs(np.mean(both - heights)) < 0.1
 
 
-def test_a_prior_in_another_direction_or_unit() -> None:
+def test_a_prior_in_another_direction_or_unit():
     normals, heights, _ = drifting()
     for factor in (-1.0, 20.0, 0.01):
         with pytest.raises(InputError, match="the prior is") as raised:
@@ -300,18 +301,18 @@ def test_a_prior_in_another_direction_or_unit() -> None:
 
 
 @pytest.mark.usefixtures("until_nothing_moves")
-def test_bilateral_is_the_dense_solution() -> None:
+def test_bilateral_is_the_dense_solution():
     normals, mask = bumps(12, 17, usable=True), holes(12, 17)
     found = integrate_normals(normals, mask)[mask]
     least_squares = dense(normals, mask, 0, 1)
     expected = dense(normals, mask, 2, 200)
     assert np.abs(expected - least_squares).max() > 0.5
-    np.testing.assert_allclose(found, expected, atol=5e-3)
+    assert_allclose(found, expected, atol=5e-3)
 
 
 @pytest.mark.usefixtures("any_scale")
 @pytest.mark.parametrize("camera", [None, CAMERA])
-def test_single_pixels_and_normals_that_are_not_usable(camera: Floats | None) -> None:
+def test_single_pixels_and_normals_that_are_not_usable(camera):
     normals, mask = bumps(12, 17), holes(12, 17)
     middle = 0.0 if camera is None else 1.0
     for some in (
@@ -322,11 +323,11 @@ def test_single_pixels_and_normals_that_are_not_usable(camera: Floats | None) ->
         found = integrate_normals(some, mask, camera_matrix=camera)
         assert np.isfinite(found[mask]).all()
         assert found[3, 4] == pytest.approx(middle, abs=1e-9)
-    np.testing.assert_allclose(found[mask], middle, atol=1e-9)
+    assert_allclose(found[mask], middle, atol=1e-9)
 
 
 @pytest.mark.usefixtures("any_scale")
-def test_backward_normals_are_bridged() -> None:
+def test_backward_normals_are_bridged():
     normals, mask, truth = sphere(60, 80, 40, 0.8)
     wrong = np.random.default_rng(3).uniform(size=mask.shape) < 0.05
     normals[wrong & mask] = unit(np.array([0.7, 0.1, -0.7]))
@@ -335,15 +336,15 @@ def test_backward_normals_are_bridged() -> None:
 
 
 @pytest.mark.usefixtures("until_nothing_moves")
-def test_turning_the_picture_turns_the_surface() -> None:
+def test_turning_the_picture_turns_the_surface():
     normals, mask = bumps(18, 25, 4), holes(18, 25, 5)
     x, y, z = np.moveaxis(normals, -1, 0)
     found = integrate_normals(normals, mask)
     again = integrate_normals(np.rot90(np.stack((-y, x, z), axis=-1)), np.rot90(mask))
-    np.testing.assert_allclose(again, np.rot90(found), atol=5e-3)
+    assert_allclose(again, np.rot90(found), atol=5e-3)
 
 
-def test_without_a_mask_all_normals_count_and_progress_is_reported() -> None:
+def test_without_a_mask_all_normals_count_and_progress_is_reported():
     normals, mask, _ = sphere(40, 50, 30, 0.9)
     kept, calls = normals.copy(), []
     expected = integrate_normals(normals, mask, discontinuity=0, progress=calls.append)
@@ -401,7 +402,7 @@ def test_bad_input(arguments, options, error, message):
         integrate_normals(*arguments, **options)
 
 
-def test_errors_of_the_normals_tear_less_than_with_the_published_weights() -> None:
+def test_errors_of_the_normals_tear_less_than_with_the_published_weights():
     """Steep waves whose normals have smooth errors of 8 degrees. The published weights tear 1.4 %
     of the pairs.
     """
@@ -422,10 +423,10 @@ def test_errors_of_the_normals_tear_less_than_with_the_published_weights() -> No
 @pytest.mark.parametrize(
     ("wave", "kept"), [(16, 1 / (1 + (16 / 64) ** 2)), (64, 0.5), (256, 1 / (1 + 4**2))]
 )
-def test_of_a_wave_the_stated_share_is_kept(wave: int, kept: float) -> None:
+def test_of_a_wave_the_stated_share_is_kept(wave, kept):
     x = np.broadcast_to(np.arange(512), (96, 512))
     k = 2 * np.pi / wave
     normals = normals_of_slopes(-0.5 * k * np.sin(k * x), 0.0 * x).astype(np.float32)
     relief = relief_of_normals(normals, np.ones(x.shape, bool))
     middle = (slice(None), slice(128, 384))
-    np.testing.assert_allclose(relief[middle], 0.5 * kept * np.cos(k * x)[middle], atol=0.01)
+    assert_allclose(relief[middle], 0.5 * kept * np.cos(k * x)[middle], atol=0.01)

@@ -1,19 +1,17 @@
 """Levelled surfaces: tilted plates with bumps, whose slopes are known."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from scenes import Floats, read_json
 from splinecli.errors import UsageError
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.pipeline.integrate import integrate_normal_map
 from splinecli.pipeline.options import IntegrateOptions, parse_level
 from splinecli.surface.levelling import level_heights, level_normals, plane_slopes
 
-Floats = NDArray[np.float64]
 SLOPES = 0.2, -0.1
 MASK = np.ones((60, 80), np.bool_)
 
@@ -35,9 +33,7 @@ def plate(slopes: tuple[float, float] = SLOPES, aspect: float = 1.0) -> tuple[Fl
 
 @pytest.mark.parametrize("points", [(), ((60, 5), (75, 50), (50, 30))], ids=["plane", "points"])
 @pytest.mark.parametrize("aspect", [1.0, 2.5])
-def test_the_slope_of_the_plate_is_removed(
-    points: tuple[tuple[int, int], ...], aspect: float
-) -> None:
+def test_the_slope_of_the_plate_is_removed(points, aspect):
     heights, normals = plate(aspect=aspect)
     slopes = plane_slopes(heights, points, aspect=aspect)
     assert slopes == pytest.approx(SLOPES, abs=0.003)
@@ -46,7 +42,7 @@ def test_the_slope_of_the_plate_is_removed(
     assert angle_between_deg(level_normals(normals, MASK, slopes), flat_normals).max() < 0.2
 
 
-def test_integrate_levels_depth_and_normals(tmp_path: Path) -> None:
+def test_integrate_levels_depth_and_normals(tmp_path):
     np.save(tmp_path / "n.npy", plate(aspect=2.0)[1].astype(np.float32))
     options = IntegrateOptions(
         normals=tmp_path / "n.npy",
@@ -56,7 +52,7 @@ def test_integrate_levels_depth_and_normals(tmp_path: Path) -> None:
         formats=("npy", "ply"),
     )
     report = integrate_normal_map(options)
-    assert json.loads(json.dumps(report)) == json.loads((tmp_path / "surface.json").read_text())
+    assert json.loads(json.dumps(report)) == read_json(tmp_path / "surface.json")
     assert report["level"]["tilt_deg"] == pytest.approx(
         np.degrees(np.arctan(np.hypot(*SLOPES))), abs=0.3
     )
@@ -69,7 +65,7 @@ def test_integrate_levels_depth_and_normals(tmp_path: Path) -> None:
     assert angle_between_deg(flat, np.broadcast_to((0.0, 0.0, 1.0), flat.shape)).max() < 0.3
 
 
-def test_levels_are_parsed() -> None:
+def test_levels_are_parsed():
     assert parse_level("plane") == () and parse_level("1,2 30,4  5,60") == (
         (1, 2),
         (30, 4),
@@ -80,7 +76,7 @@ def test_levels_are_parsed() -> None:
             parse_level(text)
 
 
-def test_points_must_be_on_the_object_and_not_in_a_line() -> None:
+def test_points_must_be_on_the_object_and_not_in_a_line():
     heights = plate()[0]
     with pytest.raises(UsageError, match="the point 90,10 of --level is not on the object"):
         plane_slopes(heights, ((1, 1), (5, 5), (90, 10)))
@@ -88,7 +84,7 @@ def test_points_must_be_on_the_object_and_not_in_a_line() -> None:
         plane_slopes(heights, ((1, 1), (5, 5), (20, 20)))
 
 
-def test_a_camera_matrix_contradicts_levelling(tmp_path: Path) -> None:
+def test_a_camera_matrix_contradicts_levelling(tmp_path):
     np.save(tmp_path / "n.npy", plate()[1].astype(np.float32))
     np.savetxt(tmp_path / "camera.txt", [[100, 0, 40], [0, 100, 30], [0, 0, 1]])
     with pytest.raises(UsageError, match="orthographic"):

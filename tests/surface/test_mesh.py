@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.testing import assert_allclose, assert_array_equal
 
 from glb_file import read_glb
+from scenes import Floats
 from splinecli.errors import UsageError
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.pixel_grid import Blocks
@@ -26,16 +27,16 @@ RAGGED = np.random.default_rng(1).uniform(size=(15, 20)) < 0.8
 RAGGED[3, 4] = True
 
 
-def face_normals(mesh: SurfaceMesh) -> NDArray[np.float64]:
+def face_normals(mesh: SurfaceMesh) -> Floats:
     """Twice the area long (T, 3)."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.triangles].astype(np.float64), 1, 0)
     return np.cross(b - a, c - a)
 
 
-def test_four_pixels() -> None:
+def test_four_pixels():
     depth = np.array([[5.0, 0.0], [1.0, 4.0]])
     mesh = surface_mesh(depth, np.ones((2, 2), bool))
-    np.testing.assert_array_equal(
+    assert_array_equal(
         mesh.vertices, [[-0.5, 0.5, 5], [0.5, 0.5, 0], [-0.5, -0.5, 1], [0.5, -0.5, 4]]
     )
     # The edge between pixels 0 and 3, which are nearly as high.
@@ -47,11 +48,11 @@ def test_four_pixels() -> None:
 
 
 @pytest.mark.parametrize("mask", [np.ones((15, 20), bool), RAGGED], ids=["full", "ragged"])
-def test_triangles_tile_the_mask_and_face_the_camera(mask: NDArray[np.bool_]) -> None:
+def test_triangles_tile_the_mask_and_face_the_camera(mask):
     mesh = surface_mesh(WAVE, mask)
     assert len(mesh.vertices) == np.count_nonzero(mask)
     # Seen along z, half a pixel each, counter-clockwise.
-    np.testing.assert_allclose(face_normals(mesh)[:, 2], 1)
+    assert_allclose(face_normals(mesh)[:, 2], 1)
     corners = mask[1:, 1:] * 1 + mask[:-1, 1:] + mask[1:, :-1] + mask[:-1, :-1]
     assert len(mesh.triangles) == 2 * np.count_nonzero(corners == 4) + np.count_nonzero(
         corners == 3
@@ -59,21 +60,21 @@ def test_triangles_tile_the_mask_and_face_the_camera(mask: NDArray[np.bool_]) ->
     assert len({frozenset(triangle) for triangle in mesh.triangles.tolist()}) == len(mesh.triangles)
 
 
-def test_perspective_vertices_project_into_their_pixels() -> None:
+def test_perspective_vertices_project_into_their_pixels():
     depth, mask = 50 + WAVE, RAGGED
     mesh = surface_mesh(depth, mask, CAMERA)
     # OpenCV's frame: y down, z forward.
     image = mesh.vertices * (1, -1, -1) @ CAMERA.T
     rows, columns = np.nonzero(mask)
-    np.testing.assert_allclose(image[:, 0] / image[:, 2], columns, atol=1e-4)
-    np.testing.assert_allclose(image[:, 1] / image[:, 2], rows, atol=1e-4)
-    np.testing.assert_allclose(image[:, 2], depth[mask], rtol=1e-6)
+    assert_allclose(image[:, 0] / image[:, 2], columns, atol=1e-4)
+    assert_allclose(image[:, 1] / image[:, 2], rows, atol=1e-4)
+    assert_allclose(image[:, 2], depth[mask], rtol=1e-6)
     towards_camera = -mesh.vertices[mesh.triangles].mean(axis=1)
     assert ((face_normals(mesh) * towards_camera).sum(axis=1) > 0).all()
 
 
 @pytest.mark.parametrize("camera", [None, CAMERA])
-def test_steps_are_left_open(camera: NDArray[np.float64] | None) -> None:
+def test_steps_are_left_open(camera):
     height = np.repeat([0.0, 10.0], [4, 5])[None] + np.zeros((6, 1))
     # A step of 10 pixels at a focal length of sqrt(100 * 110).
     depth = height if camera is None else 7 * np.exp(-height / np.sqrt(11_000))
@@ -91,15 +92,15 @@ def test_steps_are_left_open(camera: NDArray[np.float64] | None) -> None:
         surface_mesh(depth, mask, largest_step=-1)
 
 
-def test_pixels_without_triangles() -> None:
+def test_pixels_without_triangles():
     for mask in (np.eye(4, dtype=bool), np.ones((1, 5), bool)):
         mesh = surface_mesh(np.zeros(mask.shape), mask)
         assert mesh.triangles.shape == (0, 3)
-        np.testing.assert_array_equal(mesh.normals, np.tile((0, 0, 1), (len(mesh.vertices), 1)))
+        assert_array_equal(mesh.normals, np.tile((0, 0, 1), (len(mesh.vertices), 1)))
 
 
 @pytest.mark.parametrize("camera", [None, CAMERA])
-def test_attributes_of_vertices(camera: NDArray[np.float64] | None) -> None:
+def test_attributes_of_vertices(camera):
     colours, normal_map, mask = COLOURS, np.zeros((15, 20, 3)), RAGGED
     normal_map[..., 2] = 1
     normal_map[3, 4] = (0.6, 0, 0.8)
@@ -109,19 +110,17 @@ def test_attributes_of_vertices(camera: NDArray[np.float64] | None) -> None:
     np.testing.assert_array_equal(mesh.colours, colours[mask])
     rows, columns = np.nonzero(mask)
     expected = np.stack(((columns + 0.5) / 20, (rows + 0.5) / 15), axis=1)
-    np.testing.assert_allclose(mesh.uvs, expected, atol=1e-6)
+    assert_allclose(mesh.uvs, expected, atol=1e-6)
     # Outside the mask, the texture goes on with the colours of the border.
     assert {tuple(colour) for colour in mesh.texture.reshape(-1, 3)} == {
         tuple(c) for c in colours[mask]
     }
 
 
-def test_normals_of_the_triangles() -> None:
+def test_normals_of_the_triangles():
     mesh = surface_mesh(0.5 * COLUMNS - 2.0 * ROWS, np.ones((15, 20), bool))
     slope = np.array((-0.5, -2, 1))
-    np.testing.assert_allclose(
-        mesh.normals, np.tile(slope / np.linalg.norm(slope), (300, 1)), atol=1e-6
-    )
+    assert_allclose(mesh.normals, np.tile(slope / np.linalg.norm(slope), (300, 1)), atol=1e-6)
 
 
 RNG = np.random.default_rng(0)
@@ -129,27 +128,25 @@ MASK = np.hypot(*np.mgrid[-20:20, -25:25]) < 18
 
 
 @pytest.mark.parametrize("share", [1.0, 0.01])
-def test_the_number_of_blocks_is_bounded_for_scattered_pixels(share: float) -> None:
+def test_the_number_of_blocks_is_bounded_for_scattered_pixels(share):
     mask = RNG.random((300, 400)) < share
     blocks = Blocks.over(mask, 100)
     assert 50 <= np.count_nonzero(blocks.mask) <= 200
 
 
 @pytest.mark.parametrize("step", [1, 3, 7])
-def test_samples_are_those_of_scipy(step: int) -> None:
+def test_samples_are_those_of_scipy(step):
     blocks = Blocks.of_step(MASK, step)
     values = RNG.random((np.count_nonzero(blocks.mask), 2)).astype(np.float32)
     found = blocks.sample(blocks.spread(values), *np.nonzero(MASK))
     for column, of_blocks in zip(found.T, values.T, strict=True):
         depth = np.full(blocks.mask.shape, np.nan)
         depth[blocks.mask] = of_blocks
-        np.testing.assert_allclose(column, blocks.interpolate(depth, MASK), atol=1e-6)
+        assert_allclose(column, blocks.interpolate(depth, MASK), atol=1e-6)
 
 
 SIDE = 90
 CAMERA_OF_SPHERE = np.array([[120.0, 0.0, 40.0], [0.0, 130.0, 47.0], [0.0, 0.0, 1.0]])
-
-Floats = NDArray[np.float64]
 
 
 def measured(columns: Floats, rows: Floats) -> Floats:
@@ -166,9 +163,7 @@ def height_of_dome(columns: Floats, rows: Floats) -> Floats:
     return np.asarray(np.sqrt(np.maximum(60.0**2 - (columns - 44.5) ** 2 - (rows - 44.5) ** 2, 0)))
 
 
-def dome(
-    camera: NDArray[np.float64] | None, odd: int = 0
-) -> tuple[tuple[Any, ...], NDArray[np.float64]]:
+def dome(camera: Floats | None, odd: int = 0) -> tuple[tuple[Any, ...], Floats]:
     """Return what surface_mesh takes of the shape of a dome alone, and the normal map with the
     relief.
     """
@@ -188,14 +183,14 @@ def camera(request: pytest.FixtureRequest) -> Any:
 
 
 @pytest.fixture(scope="module")
-def decimated(camera: NDArray[np.float64] | None) -> SurfaceMesh:
+def decimated(camera: Floats | None) -> SurfaceMesh:
     surface, normal_map = dome(camera)
     return decimated_mesh(
         *surface, n_triangles=len(surface_mesh(*surface).triangles) // 20, normal_map=normal_map
     )
 
 
-def test_normals_relit_from_the_file(decimated: SurfaceMesh) -> None:
+def test_normals_relit_from_the_file(decimated):
     full = surface_mesh(*dome(None)[0])
     assert 0.04 < len(decimated.triangles) / len(full.triangles) <= 0.05
     ((_, content),) = encode_surface(Surface(np.zeros((1, 1)), decimated, "pixel", 1.0), ["glb"])
@@ -227,9 +222,7 @@ def test_normals_relit_from_the_file(decimated: SurfaceMesh) -> None:
     assert without.mean() > 10
 
 
-def test_tangents_are_those_that_viewers_compute(
-    decimated: SurfaceMesh, camera: NDArray[np.float64] | None
-) -> None:
+def test_tangents_are_those_that_viewers_compute(decimated, camera):
     """MikkTSpace: the mean of the derivatives of the position along u in the triangles around a
     vertex.
     """
@@ -254,7 +247,7 @@ def test_vertices_stay_on_the_dome_and_in_their_places(decimated, camera):
     x, y = decimated.vertices[:, 0] + 44.5, 44.5 - decimated.vertices[:, 1]
     if camera is not None:
         x, y, _ = (decimated.vertices / -decimated.vertices[:, 2:] * (1, -1, -1) @ camera.T).T
-    np.testing.assert_allclose(np.stack((columns, rows)), np.stack((x, y)), atol=1e-3)
+    assert_allclose(np.stack((columns, rows)), np.stack((x, y)), atol=1e-3)
     height = height_of_dome(columns, rows)
     depth = height if camera is None else -(3 - height / 125)
     scale = 1 if camera is None else 125
@@ -277,5 +270,5 @@ def test_blocks_of_a_large_map_have_its_shape(camera, odd, monkeypatch):
     assert np.abs(found - height_of_dome(columns, rows))[near].mean() < 0.5  # pixels
     if camera is None:
         middle = (SIDE - 1 + odd) / 2
-        np.testing.assert_allclose(mesh.vertices[:, 0], columns - 44.5, atol=1e-3)
-        np.testing.assert_allclose(mesh.vertices[:, 1], middle - rows, atol=1e-3)
+        assert_allclose(mesh.vertices[:, 0], columns - 44.5, atol=1e-3)
+        assert_allclose(mesh.vertices[:, 1], middle - rows, atol=1e-3)

@@ -2,12 +2,12 @@
 
 import io
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -40,56 +40,56 @@ def load(content: bytes, form: str) -> Any:
 
 
 @pytest.mark.parametrize("coloured", [False, True])
-def test_ply_and_stl(coloured: bool) -> None:
+def test_ply_and_stl(coloured):
     mesh = wave(coloured)
     stl = load(encode(mesh, "stl")["mesh.stl"], "stl")
-    np.testing.assert_array_equal(stl.triangles, mesh.vertices[mesh.triangles])
+    assert_array_equal(stl.triangles, mesh.vertices[mesh.triangles])
     content = encode(mesh, "ply")["mesh.ply"]
     read = load(content, "ply")
-    np.testing.assert_array_equal(read.vertices, mesh.vertices)
-    np.testing.assert_array_equal(read.faces, mesh.triangles)
+    assert_array_equal(read.vertices, mesh.vertices)
+    assert_array_equal(read.faces, mesh.triangles)
     # trimesh passes over the normals.
     width = 28 if coloured else 24
     body = content.partition(b"end_header\n")[2][: width * len(mesh.vertices)]
     normals = np.frombuffer(body, np.uint8).reshape(-1, width)[:, 12:24].copy().view("<f4")
-    np.testing.assert_allclose(normals, mesh.normals, atol=1e-6)
+    assert_allclose(normals, mesh.normals, atol=1e-6)
     assert b"property float nx\nproperty float ny\nproperty float nz\n" in content
     assert content.startswith(b"ply\nformat binary_little_endian 1.0\ncomment unit: pixel\n")
     assert read.visual.kind == ("vertex" if coloured else None)
     if coloured:
-        np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], COLOURS.reshape(-1, 3))
+        assert_array_equal(read.visual.vertex_colors[:, :3], COLOURS.reshape(-1, 3))
 
 
 @pytest.mark.parametrize("coloured", [False, True])
-def test_obj(coloured: bool, tmp_path: Path) -> None:
+def test_obj(coloured, tmp_path):
     mesh = wave(coloured)
     files = encode(mesh, "obj", unit="millimetre")
     assert sorted(files) == ["mesh.mtl", "mesh.obj", *(["mesh.png"] if coloured else [])]
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
     read: Any = trimesh.load_mesh(tmp_path / "mesh.obj", process=False, maintain_order=True)
-    np.testing.assert_allclose(read.vertices, mesh.vertices, atol=1e-6)
-    np.testing.assert_array_equal(read.faces, mesh.triangles)
+    assert_allclose(read.vertices, mesh.vertices, atol=1e-6)
+    assert_array_equal(read.faces, mesh.triangles)
     normals = [
         line.split()[1:]
         for line in files["mesh.obj"].decode().splitlines()
         if line.startswith("vn ")
     ]
-    np.testing.assert_allclose(np.array(normals, float), mesh.normals, atol=1e-6)
-    np.testing.assert_allclose(read.visual.uv, mesh.uvs * (1, -1) + (0, 1), atol=1e-6)
+    assert_allclose(np.array(normals, float), mesh.normals, atol=1e-6)
+    assert_allclose(read.visual.uv, mesh.uvs * (1, -1) + (0, 1), atol=1e-6)
     if coloured:
-        np.testing.assert_array_equal(np.asarray(read.visual.material.image), COLOURS)
+        assert_array_equal(np.asarray(read.visual.material.image), COLOURS)
 
 
 @pytest.mark.parametrize("coloured", [False, True])
-def test_glb(coloured: bool) -> None:
+def test_glb(coloured):
     mesh = wave(coloured)
     content = encode(mesh, "glb", millimetres=2)["mesh.glb"]
     tree, arrays = read_glb(content)
-    np.testing.assert_allclose(arrays["POSITION"], mesh.vertices * 0.002, rtol=1e-6)
-    np.testing.assert_array_equal(arrays["indices"], mesh.triangles)
-    np.testing.assert_allclose(arrays["NORMAL"], mesh.normals, atol=1e-6)
-    np.testing.assert_allclose(arrays["TEXCOORD_0"], mesh.uvs, atol=1e-6)
+    assert_allclose(arrays["POSITION"], mesh.vertices * 0.002, rtol=1e-6)
+    assert_array_equal(arrays["indices"], mesh.triangles)
+    assert_allclose(arrays["NORMAL"], mesh.normals, atol=1e-6)
+    assert_allclose(arrays["TEXCOORD_0"], mesh.uvs, atol=1e-6)
     [material] = tree["materials"]
     matte = material["pbrMetallicRoughness"]
     assert (matte["metallicFactor"], matte["roughnessFactor"], material["doubleSided"]) == (
@@ -99,10 +99,10 @@ def test_glb(coloured: bool) -> None:
     )
     assert ("TANGENT" in arrays, "normal" in arrays) == (False, False)  # the normals are exact
     if coloured:
-        np.testing.assert_array_equal(arrays["colour"], COLOURS)
+        assert_array_equal(arrays["colour"], COLOURS)
     else:
         assert matte["baseColorFactor"] == pytest.approx([GRAY / 255] * 3 + [1])
-    [read] = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()
+    [read] = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()  # type: ignore[attr-defined]
     assert len(read.faces) == len(mesh.triangles)
 
 
@@ -113,7 +113,7 @@ def glossy(specular: NDArray[np.floating]) -> SurfaceMesh:
     )
 
 
-def test_reflectance_of_glb() -> None:
+def test_reflectance_of_glb():
     """KHR_materials_specular has 0.04 times its colour as reflectance, and trimesh reads the rest
     as before.
     """
@@ -125,11 +125,11 @@ def test_reflectance_of_glb() -> None:
         decode_transfer(arrays["specular"].astype(np.float32) / 255, None)
         * extension["specularColorFactor"]
     )
-    np.testing.assert_allclose(0.04 * colour[3, :, 1], 0.08 * specular, rtol=0.02)
-    np.testing.assert_array_equal(arrays["colour"], COLOURS)
+    assert_allclose(0.04 * colour[3, :, 1], 0.08 * specular, rtol=0.02)
+    assert_array_equal(arrays["colour"], COLOURS)
     assert (arrays["gloss"] == (255, 102, 0)).all()
-    [read] = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()
-    np.testing.assert_array_equal(np.asarray(read.visual.material.baseColorTexture), COLOURS)
+    [read] = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()  # type: ignore[attr-defined]
+    assert_array_equal(np.asarray(read.visual.material.baseColorTexture), COLOURS)
     for usual in (None, np.float32(0.5)):
         tree, _ = read_glb(
             encode(replace(glossy(np.float32(1)), specular=usual), "glb")["mesh.glb"]
@@ -141,7 +141,7 @@ def test_reflectance_of_glb() -> None:
     }
 
 
-def test_gloss_of_obj(tmp_path: Path) -> None:
+def test_gloss_of_obj(tmp_path):
     files = encode(glossy(np.float32(0.5)), "obj")
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
@@ -160,10 +160,10 @@ def test_gloss_of_obj(tmp_path: Path) -> None:
     assert float(lines["Ks"].split()[0]) == pytest.approx(0.04 / (4 * 0.4**4), abs=0.003)
     assert float(lines["Ns"]) == pytest.approx(2 / 0.4**4 - 2)
     read: Any = trimesh.load_mesh(tmp_path / "mesh.obj", process=False, maintain_order=True)
-    np.testing.assert_array_equal(np.asarray(read.visual.material.image), COLOURS)
+    assert_array_equal(np.asarray(read.visual.material.image), COLOURS)
 
 
-def test_a_mesh_without_triangles() -> None:
+def test_a_mesh_without_triangles():
     mesh = wave(mask=np.eye(*SHAPE, dtype=bool))
     assert b"element vertex 15\n" in encode(mesh, "ply")["mesh.ply"]
     assert encode(mesh, "obj")["mesh.obj"].count(b"\nv ") == 15

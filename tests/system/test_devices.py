@@ -21,7 +21,7 @@ from splinecli.system.machine import (
     ("name", "available", "chosen"),
     [("auto", True, "cuda"), ("auto", False, "cpu"), ("cpu", True, "cpu"), ("cuda", True, "cuda")],
 )
-def test_choice(monkeypatch: pytest.MonkeyPatch, name: str, available: bool, chosen: str) -> None:
+def test_choice(monkeypatch, name, available, chosen):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: available)
     assert choose_device(name).type == chosen
 
@@ -30,15 +30,13 @@ def test_choice(monkeypatch: pytest.MonkeyPatch, name: str, available: bool, cho
     ("name", "problem"),
     [("gpu", "no device named 'gpu'; expected auto, cpu or cuda"), ("cuda", "no CUDA device")],
 )
-def test_devices_that_are_not_there(
-    monkeypatch: pytest.MonkeyPatch, name: str, problem: str
-) -> None:
+def test_devices_that_are_not_there(monkeypatch, name, problem):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(UsageError, match=problem):
         choose_device(name)
 
 
-def test_automatic_precision_agrees_with_the_kernel_s_list_of_instructions() -> None:
+def test_automatic_precision_agrees_with_the_kernel_s_list_of_instructions():
     listing = Path("/proc/cpuinfo")
     flags = set(listing.read_text().split()) if listing.exists() else set()
     if "flags" not in flags or not hasattr(torch.cpu, "get_capabilities"):
@@ -89,7 +87,7 @@ QUOTAS = {
 
 
 @pytest.mark.parametrize("case", QUOTAS)
-def test_quotas_of_control_groups(mount: Path, case: str) -> None:
+def test_quotas_of_control_groups(mount, case):
     """The groups above limit a process, too."""
     groups, files, expected = QUOTAS[case]
     for name, text in files.items():
@@ -99,7 +97,7 @@ def test_quotas_of_control_groups(mount: Path, case: str) -> None:
     assert sorted(cgroup_quotas()) == expected
 
 
-def test_memory_left_in_control_groups(mount: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_left_in_control_groups(mount, monkeypatch):
     """A job of Slurm or systemd is in a group within groups. Each of them may have a limit."""
     monkeypatch.setattr(machine, "_free_memory", lambda: 9e9)
     monkeypatch.setattr(machine, "_left_in_address_space", lambda: 8e9)
@@ -114,9 +112,7 @@ def test_memory_left_in_control_groups(mount: Path, monkeypatch: pytest.MonkeyPa
     assert available_memory() == 5000 - 3000 + 500
 
 
-def test_memory_left_in_control_groups_of_version_1(
-    mount: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_memory_left_in_control_groups_of_version_1(mount, monkeypatch):
     monkeypatch.setattr(machine, "_free_memory", lambda: 8e9)
     monkeypatch.setattr(machine, "_left_in_address_space", lambda: 9e9)
     enter(mount, "12:cpu:/cpu\n4:memory:/box/ours\n0::/\n")
@@ -138,10 +134,8 @@ def test_memory_left_in_control_groups_of_version_1(
     [(8, 8, [], 8), (8, 3, [], 3), (8, 8, [2.5, 4], 2), (8, 8, [0.5], 1), (None, 1, [], 1)],
 )
 def test_available_cores(cores, affinity, quotas, expected, monkeypatch):
-    monkeypatch.setattr(machine.os, "cpu_count", lambda: cores)
-    monkeypatch.setattr(
-        machine.os, "sched_getaffinity", lambda _: set(range(affinity)), raising=False
-    )
+    monkeypatch.setattr("os.cpu_count", lambda: cores)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(affinity)), raising=False)
     monkeypatch.setattr(machine, "cgroup_quotas", lambda: quotas)
     assert machine.count_available_cores() == expected
 

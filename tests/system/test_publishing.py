@@ -11,7 +11,6 @@ import sys
 import types
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO
 from unittest.mock import Mock
 
 import numpy as np
@@ -53,9 +52,7 @@ FULL = OSError(errno.ENOSPC, "No space left on device")
 
 
 @pytest.mark.parametrize("first", [True, False])
-def test_a_folder_with_a_report_is_whole_after_a_kill_at_any_step(
-    tmp_path: Path, first: bool
-) -> None:
+def test_a_folder_with_a_report_is_whole_after_a_kill_at_any_step(tmp_path, first):
     reports, step = [], 0
     while True:
         folder = tmp_path / str(step)
@@ -85,10 +82,8 @@ def test_a_folder_with_a_report_is_whole_after_a_kill_at_any_step(
     assert reports.count(None) > 5
 
 
-def test_a_message_names_the_file_that_was_asked_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def save_half(file: IO[bytes], *_: object, **__: object) -> None:
+def test_a_message_names_the_file_that_was_asked_for(tmp_path, monkeypatch):
+    def save_half(file, *_, **__):
         file.write(b"half")
         raise FULL
 
@@ -100,15 +95,13 @@ def test_a_message_names_the_file_that_was_asked_for(
     assert not list(tmp_path.iterdir())
 
 
-def test_ctrl_c_between_renames_leaves_no_report(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_between_renames_leaves_no_report(tmp_path, monkeypatch):
     """At any rename, the last one included, it stays a KeyboardInterrupt, and no hidden file is
     left.
     """
     replace, calls = Path.replace, []
 
-    def interrupt(path: Path, target: Path) -> Path:
+    def interrupt(path, target):
         calls.append(path)
         if len(calls) == last:
             raise KeyboardInterrupt
@@ -125,7 +118,7 @@ def test_ctrl_c_between_renames_leaves_no_report(
         assert content(folder).items() <= NEW.items()
 
 
-def test_a_folder_in_the_place_of_a_file(tmp_path: Path) -> None:
+def test_a_folder_in_the_place_of_a_file(tmp_path):
     (tmp_path / "a.txt").mkdir()
     (tmp_path / "pictures").touch()
     with pytest.raises(OutputError, match=r"a\.txt: found a folder, expected a file"):
@@ -148,9 +141,7 @@ LINKS: dict[str, Callable[[Path, Path], None]] = {
 
 @pytest.mark.parametrize("kind", LINKS)
 @pytest.mark.parametrize("name", [REPORT, "a.txt", "only old.txt", "pictures/1.png"])
-def test_what_stands_in_a_file_s_place_is_replaced_and_not_followed(
-    tmp_path: Path, kind: str, name: str
-) -> None:
+def test_what_stands_in_a_file_s_place_is_replaced_and_not_followed(tmp_path, kind, name):
     folder, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
     write(elsewhere, {"precious": b"mine"})
     (folder / name).parent.mkdir(parents=True)
@@ -161,7 +152,7 @@ def test_what_stands_in_a_file_s_place_is_replaced_and_not_followed(
     assert not any(path.is_symlink() for path in folder.rglob("*"))
 
 
-def test_a_link_in_the_place_of_a_subfolder_is_refused(tmp_path: Path) -> None:
+def test_a_link_in_the_place_of_a_subfolder_is_refused(tmp_path):
     folder, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
     write(elsewhere, {"1.png": b"mine"})
     write(folder, {REPORT: b"old"})
@@ -175,7 +166,7 @@ def test_a_link_in_the_place_of_a_subfolder_is_refused(tmp_path: Path) -> None:
     assert content(elsewhere) == {"1.png": b"mine"}
 
 
-def test_a_folder_made_for_nothing_goes_again(tmp_path: Path) -> None:
+def test_a_folder_made_for_nothing_goes_again(tmp_path):
     (tmp_path / "old").mkdir()
     for name in ("new/deeper", "old"):
         with pytest.raises(ZeroDivisionError), held_folder(tmp_path / name):
@@ -183,7 +174,7 @@ def test_a_folder_made_for_nothing_goes_again(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["old"]
 
 
-def test_what_a_killed_process_was_writing_goes(tmp_path: Path) -> None:
+def test_what_a_killed_process_was_writing_goes(tmp_path):
     folder = tmp_path / "out"
     mine = MINE | {
         ".draft.unfinished/a": b"mine",
@@ -201,7 +192,7 @@ def test_what_a_killed_process_was_writing_goes(tmp_path: Path) -> None:
     assert link.is_symlink()
 
 
-def test_everything_is_on_the_disk_before_an_earlier_file_goes(tmp_path: Path) -> None:
+def test_everything_is_on_the_disk_before_an_earlier_file_goes(tmp_path):
     """The order of syncs and of changes, as a power cut would see it."""
     folder = tmp_path / "new" / "out"
     publish(folder, OLD)
@@ -211,9 +202,7 @@ def test_everything_is_on_the_disk_before_an_earlier_file_goes(tmp_path: Path) -
     assert len(list(missing_syncs(without_syncs, REPORT))) > len(NEW)
 
 
-def test_the_names_of_new_folders_are_on_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_names_of_new_folders_are_on_the_disk(tmp_path, monkeypatch):
     synced: list[Path] = []
     monkeypatch.setattr("splinecli.system.files.sync", synced.append)
     files.write_bytes(tmp_path / "a" / "b" / "c.txt", b"")
@@ -243,7 +232,7 @@ def system(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
 
 
 @pytest.mark.usefixtures("system")
-def test_a_folder_is_held_by_one_at_a_time(tmp_path: Path) -> None:
+def test_a_folder_is_held_by_one_at_a_time(tmp_path):
     with (
         locked(tmp_path / "run"),
         pytest.raises(
@@ -258,7 +247,7 @@ def test_a_folder_is_held_by_one_at_a_time(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("system")
-def test_one_at_a_time_also_while_the_lock_file_is_removed(tmp_path: Path) -> None:
+def test_one_at_a_time_also_while_the_lock_file_is_removed(tmp_path):
     """Each process adds one to a number in a file: with two at once, some would be lost."""
     number, children = tmp_path / "number", []
     number.write_text("0")
@@ -274,7 +263,7 @@ def test_one_at_a_time_also_while_the_lock_file_is_removed(tmp_path: Path) -> No
     assert number.read_text() == "60"
 
 
-def test_files_that_a_process_has_locked_are_not_left_ones(tmp_path: Path) -> None:
+def test_files_that_a_process_has_locked_are_not_left_ones(tmp_path):
     running, left = (tmp_path / f".{name}.splinecli-unfinished" for name in ("running", "left"))
     left.touch()
     warnings: list[str] = []
@@ -286,14 +275,14 @@ def test_files_that_a_process_has_locked_are_not_left_ones(tmp_path: Path) -> No
     assert len(warnings) == 1 and not any(tmp_path.iterdir())
 
 
-def test_the_lock_file_of_another_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_lock_file_of_another_user(tmp_path, monkeypatch):
     (tmp_path / LOCK).touch()
     monkeypatch.setattr(
         os, "open", Mock(side_effect=PermissionError(errno.EACCES, "Permission denied"))
     )
     message = (
-        r"\.lock: this lock file belongs to another user.*remove the file\."
-        r" Otherwise choose another -o"
+        r"\.lock: this lock file belongs to another user.*remove the file\. Otherwise choose "
+        r"another -o"
     )
     with pytest.raises(OutputError, match=message), locked(tmp_path):
         pytest.fail("it has no lock")
@@ -305,7 +294,7 @@ def names_in(folder: Path) -> list[str]:
     return [path.name for path in folder.iterdir()]
 
 
-def test_a_new_file_in_folders_that_do_not_exist_yet(tmp_path: Path) -> None:
+def test_a_new_file_in_folders_that_do_not_exist_yet(tmp_path):
     (tmp_path / "plain").touch()
     path = tmp_path / "a" / "b" / "out.txt"
     write_text(path, "déjà vu\n")
@@ -314,9 +303,7 @@ def test_a_new_file_in_folders_that_do_not_exist_yet(tmp_path: Path) -> None:
     assert names_in(path.parent) == ["out.txt"]
 
 
-def test_a_full_disk_and_ctrl_c_leave_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_and_ctrl_c_leave_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "out.bin"
     write_bytes(path, b"old")
 
@@ -331,7 +318,7 @@ def test_a_full_disk_and_ctrl_c_leave_the_old_file(
         assert names_in(tmp_path) == ["out.bin"]
 
 
-def test_folders_made_for_nothing_go_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folders_made_for_nothing_go_again(tmp_path, monkeypatch):
     monkeypatch.setattr(
         "splinecli.system.files.sync", Mock(side_effect=OSError(28, "No space left on device"))
     )
@@ -341,6 +328,6 @@ def test_folders_made_for_nothing_go_again(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("text", ["[" * 200_000, '{"a": ' + "9" * 400 + "}", "9" * 5000, "{", ""])
-def test_json_that_cannot_be_used_is_a_value_error(text: str) -> None:
+def test_json_that_cannot_be_used_is_a_value_error(text):
     with pytest.raises(ValueError):
         parse_json(text)

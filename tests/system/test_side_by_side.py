@@ -20,10 +20,10 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
     torch.set_num_threads(before)
 
 
-def test_results_come_in_order_and_parts_run_at_the_same_time(threads: int) -> None:
+def test_results_come_in_order_and_parts_run_at_the_same_time(threads):
     together = threading.Barrier(threads, timeout=60)
 
-    def square(number: int) -> int:
+    def square(number):
         together.wait()
         time.sleep(0.01 * (number % 3))
         assert torch.get_num_threads() == 1 and torch.is_inference_mode_enabled()
@@ -33,14 +33,14 @@ def test_results_come_in_order_and_parts_run_at_the_same_time(threads: int) -> N
     assert torch.get_num_threads() == threads
 
 
-def test_few_results_wait(threads: int) -> None:
+def test_few_results_wait(threads):
     begun: list[int] = []
     for done, _ in enumerate(side_by_side(begun.append, range(100)), 1):
         assert len(begun) <= done + threads
 
 
-def test_an_error_comes_in_its_turn_and_ends_the_rest(threads: int) -> None:
-    def refuse(number: int) -> int:
+def test_an_error_comes_in_its_turn_and_ends_the_rest(threads):
+    def refuse(number):
         if number == 5:
             raise ValueError(f"part {number}")
         return number
@@ -52,7 +52,7 @@ def test_an_error_comes_in_its_turn_and_ends_the_rest(threads: int) -> None:
     assert torch.get_num_threads() == threads
 
 
-def test_a_new_thread_begins_with_one_thread_of_its_own(threads: int) -> None:
+def test_a_new_thread_begins_with_one_thread_of_its_own(threads):
     """OpenMP's number, which PyTorch sets in a thread only before its first operation there."""
     openmp = ctypes.CDLL(None)
     if not hasattr(openmp, "omp_get_max_threads"):
@@ -62,13 +62,11 @@ def test_a_new_thread_begins_with_one_thread_of_its_own(threads: int) -> None:
     )
 
 
-def test_callers_in_several_threads_restore_the_number_in_each(threads: int) -> None:
+def test_callers_in_several_threads_restore_the_number_in_each(threads):
     """The first one ends while the second one is within."""
     first_in, second_in, first_out = (threading.Event() for _ in range(3))
 
-    def call(
-        begins: threading.Event | None, began: threading.Event, ends: threading.Event
-    ) -> tuple[int, int, int]:
+    def call(begins, began, ends):
         assert begins is None or begins.wait(60)
         with one_thread_each() as before:
             within = torch.get_num_threads()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scenes import directions_at, shade, sphere
+from scenes import Floats, directions_at, shade, sphere
 from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.film import (
     FEWEST_FRAMES,
@@ -27,12 +27,12 @@ from splinecli.pictures.maps import encode_png
 SIZE = 96
 
 
-def encode_bt709(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+def encode_bt709(linear: Floats) -> Floats:
     """The curve of ITU-R BT.709, from its text."""
     return np.where(linear < 0.018, 4.5 * linear, 1.099 * np.maximum(linear, 1e-9) ** 0.45 - 0.099)
 
 
-def sphere_film(lights: NDArray[np.float64], texture: float = 0.3) -> NDArray[np.uint8]:
+def sphere_film(lights: Floats, texture: float = 0.3) -> NDArray[np.uint8]:
     """Frames (F, SIZE, SIZE) of a matte sphere with fine texture, under lights (F, 3),
     with noise.
     """
@@ -45,7 +45,7 @@ def sphere_film(lights: NDArray[np.float64], texture: float = 0.3) -> NDArray[np
 
 
 def write_film(path: Path, frames: NDArray[np.uint8], codec: str = "MJPG") -> Path:
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 25, frames.shape[:0:-1])
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 25, frames.shape[:0:-1])  # type: ignore[attr-defined]
     assert video.isOpened()
     for frame in frames:
         video.write(cv2.merge([frame, frame, frame]))
@@ -53,13 +53,13 @@ def write_film(path: Path, frames: NDArray[np.uint8], codec: str = "MJPG") -> Pa
     return path
 
 
-def path_of_lamp(count: int) -> NDArray[np.float64]:
+def path_of_lamp(count: int) -> Floats:
     """Lights (count, 3) along a slow spiral, as a lamp is carried."""
     return directions_at(np.linspace(0, 6 * np.pi, count), np.radians(np.linspace(15, 50, count)))
 
 
 @pytest.mark.parametrize(("name", "codec"), [("clip.avi", "MJPG"), ("clip.mp4", "mp4v")])
-def test_frames_under_different_lights_are_chosen(tmp_path: Path, name: str, codec: str) -> None:
+def test_frames_under_different_lights_are_chosen(tmp_path, name, codec):
     lights, frames = path_of_lamp(150), sphere_film(path_of_lamp(150))
     film = write_film(tmp_path / name, frames, codec)
     chosen = choose_frames(film)
@@ -71,7 +71,7 @@ def test_frames_under_different_lights_are_chosen(tmp_path: Path, name: str, cod
         assert np.abs(found.mean(axis=2) - frames[number]).mean() < 6  # compression
 
 
-def test_blurred_overexposed_and_dark_frames_are_not_chosen(tmp_path: Path) -> None:
+def test_blurred_overexposed_and_dark_frames_are_not_chosen(tmp_path):
     frames = sphere_film(path_of_lamp(120))
     blurred, bright, dark = range(20, 24), range(60, 63), range(90, 94)
     for number in blurred:
@@ -82,14 +82,14 @@ def test_blurred_overexposed_and_dark_frames_are_not_chosen(tmp_path: Path) -> N
     assert not {*blurred, *bright, *dark}.intersection(chosen)
 
 
-def test_the_curve_is_undone() -> None:
+def test_the_curve_is_undone():
     linear = np.linspace(0, 1, 256)
     stored = encode_bt709(linear).astype(np.float32)
     np.testing.assert_allclose(decode_transfer(stored, BT709), linear, atol=2e-4)
 
 
 @pytest.mark.parametrize(("number", "curve"), [(1, BT709), (8, 1.0), (13, None)])
-def test_code_points_go_before_other_curves(tmp_path: Path, number: int, curve: object) -> None:
+def test_code_points_go_before_other_curves(tmp_path, number, curve):
     """cICP, ITU-T H.273: BT.709, linear and sRGB. 16 and 18 are those of films with a high dynamic
     range.
     """
@@ -101,7 +101,7 @@ def test_code_points_go_before_other_curves(tmp_path: Path, number: int, curve: 
         assert (found.curve, found.unread) == expected
 
 
-def test_what_is_no_film_or_truncated_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_film_or_truncated_is_refused(tmp_path):
     for content, problem in (
         (b"", "found no film"),
         (b"#EXTM3U\n#EXTINF:1,\nother.ts\n", "found no film"),
@@ -123,7 +123,7 @@ def test_what_is_no_film_or_truncated_is_refused(tmp_path: Path) -> None:
             choose_frames(film)
 
 
-def test_a_film_whose_name_is_not_utf8(tmp_path: Path) -> None:
+def test_a_film_whose_name_is_not_utf8(tmp_path):
     """OpenCV crashes on such a name."""
     film, other = tmp_path / "clip.mp4", tmp_path / os.fsdecode(b"clip-\xff.mp4")
     write_film(film, sphere_film(path_of_lamp(60)), "mp4v")
@@ -136,7 +136,7 @@ def test_a_film_whose_name_is_not_utf8(tmp_path: Path) -> None:
     np.testing.assert_array_equal(list(read_frames(other, chosen)), list(read_frames(film, chosen)))
 
 
-def test_what_ffmpeg_prints_of_a_damaged_film_is_caught(tmp_path: Path) -> None:
+def test_what_ffmpeg_prints_of_a_damaged_film_is_caught(tmp_path):
     """Its threads also print between the calls, so a process of its own reads the film, slowly."""
     rng = np.random.default_rng(2)
     film = write_film(tmp_path / "clip.avi", sphere_film(path_of_lamp(100)), "XVID")

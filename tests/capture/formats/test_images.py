@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageFile
 from PIL.TiffImagePlugin import IFDRational
 
-from capture.conftest import WriteImage
 from scenes import ring_lights, with_chunk, write_capture
 from splinecli.capture import CaptureOptions, open_capture, read_image, read_mask
 from splinecli.capture.formats.facts import (
@@ -44,16 +44,16 @@ def test_integers_are_scaled_by_their_full_range(write_image, name, stored):
     image = read_image(write_image(name, stored))
     assert image.dtype == np.float32
     full = np.float32(np.iinfo(stored.dtype).max)
-    np.testing.assert_array_equal(image, stored.reshape(7, 9, -1).astype(np.float32) / full)
+    assert_array_equal(image, stored.reshape(7, 9, -1).astype(np.float32) / full)
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 @pytest.mark.parametrize("channels", [1, 3])
-def test_floating_point_tiff_is_kept(tmp_path: Path, dtype: type, channels: int) -> None:
+def test_floating_point_tiff_is_kept(tmp_path, dtype, channels):
     stored = RNG.uniform(0, 5, (7, 9, channels)).astype(dtype)
     photometric = "rgb" if channels == 3 else "minisblack"
     tifffile.imwrite(tmp_path / "a.tif", stored.squeeze(), photometric=photometric)
-    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), stored.astype(np.float32))
+    assert_array_equal(read_image(tmp_path / "a.tif"), stored.astype(np.float32))
 
 
 @pytest.mark.parametrize(
@@ -66,12 +66,12 @@ def test_floating_point_tiff_is_kept(tmp_path: Path, dtype: type, channels: int)
     ],
     ids=["deflate", "predictor", "tiles", "bigtiff"],
 )
-def test_kinds_of_tiff(tmp_path: Path, options: dict[str, object]) -> None:
+def test_kinds_of_tiff(tmp_path, options):
     tifffile.imwrite(tmp_path / "a.tif", RGB16, photometric="rgb", **options)
-    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), RGB16 / np.float32(65535))
+    assert_array_equal(read_image(tmp_path / "a.tif"), RGB16 / np.float32(65535))
 
 
-def test_planar_and_white_is_zero_tiff_and_alpha(tmp_path: Path) -> None:
+def test_planar_and_white_is_zero_tiff_and_alpha(tmp_path):
     tifffile.imwrite(
         tmp_path / "a.tif", np.moveaxis(RGB16, 2, 0), photometric="rgb", planarconfig="separate"
     )
@@ -79,14 +79,12 @@ def test_planar_and_white_is_zero_tiff_and_alpha(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "alpha.png"), bgra)
     cv2.imwrite(str(tmp_path / "alpha.tif"), bgra)
     for name in ("a.tif", "alpha.png", "alpha.tif"):
-        np.testing.assert_array_equal(read_image(tmp_path / name), RGB16 / np.float32(65535))
+        assert_array_equal(read_image(tmp_path / name), RGB16 / np.float32(65535))
     tifffile.imwrite(tmp_path / "w.tif", 255 - RGB8[..., 0], photometric="miniswhite")
-    np.testing.assert_array_equal(
-        read_image(tmp_path / "w.tif")[..., 0], RGB8[..., 0] / np.float32(255)
-    )
+    assert_array_equal(read_image(tmp_path / "w.tif")[..., 0], RGB8[..., 0] / np.float32(255))
 
 
-def test_jpeg_channels_and_exif_orientation(write_image: WriteImage) -> None:
+def test_jpeg_channels_and_exif_orientation(write_image):
     stored = np.zeros((16, 32, 3), np.uint8)
     stored[:, :16, 0] = 255  # red on the left
     stored[:, 16:, 2] = 255  # blue on the right
@@ -100,7 +98,7 @@ def test_jpeg_channels_and_exif_orientation(write_image: WriteImage) -> None:
     image = read_image(path)
     assert image.shape == (16, 32, 3)
     apart = np.r_[:14, 18:32]  # the chroma is subsampled, so the colours mix where they meet
-    np.testing.assert_allclose(image[:, apart], stored[:, apart] / 255, atol=0.05)  # JPEG's loss
+    assert_allclose(image[:, apart], stored[:, apart] / 255, atol=0.05)  # JPEG's loss
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif", "deflate.tif", "lzw.tif"])
@@ -120,8 +118,8 @@ def test_truncated_and_damaged_images(tmp_path, write_image, capfd, name):
     for content in contents:
         path.write_bytes(content)
         message = (
-            r"is (truncated|damaged (and cannot be read|\(a checksum is wrong\)))\."
-            r" Copy or export it again\."
+            r"is (truncated|damaged (and cannot be read|\(a checksum is wrong\)))\. Copy or export "
+            r"it again\."
         )
         with pytest.raises(InputError, match=message) as caught:
             read_image(path)
@@ -134,7 +132,7 @@ def test_the_c_library_is_silent_and_gamma_is_not_applied(write_image, capfd):
     data = path.read_bytes()
     data = with_chunk(data, b"iCCP", b"x\0\0" + zlib.compress(b"no profile"))
     path.write_bytes(with_chunk(data, b"gAMA", struct.pack(">I", 45455)))
-    np.testing.assert_array_equal(read_image(path), RGB16 / np.float32(65535))
+    assert_array_equal(read_image(path), RGB16 / np.float32(65535))
     assert capfd.readouterr() == ("", "")
     cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     # libpng does complain of this file when nobody holds its mouth
@@ -148,7 +146,7 @@ NOT_FINITE = "a value that is not finite"
     ("value", "found"),
     [(np.nan, NOT_FINITE), (np.inf, NOT_FINITE), (-0.5, "the negative value -0.5")],
 )
-def test_values_no_photograph_has(tmp_path: Path, value: float, found: str) -> None:
+def test_values_no_photograph_has(tmp_path, value, found):
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, np.array([[1, value]], np.float32))
     with pytest.raises(
@@ -158,7 +156,7 @@ def test_values_no_photograph_has(tmp_path: Path, value: float, found: str) -> N
     assert ("Set values below zero" in str(caught.value)) == (value == -0.5)
 
 
-def test_files_that_are_no_such_image(tmp_path: Path) -> None:
+def test_files_that_are_no_such_image(tmp_path):
     (tmp_path / "empty.tif").touch()
     (tmp_path / "header.tif").write_bytes(b"II*\0\x08\0\0\0")
     tifffile.imwrite(tmp_path / "int.tif", RGB16.astype(np.int32), photometric="rgb")
@@ -177,7 +175,7 @@ def test_files_that_are_no_such_image(tmp_path: Path) -> None:
             read_image(tmp_path / name)
 
 
-def test_mask(write_image: WriteImage) -> None:
+def test_mask(write_image):
     for stored, expected in (
         (np.array([[0, 1], [1, 0]], np.uint8), [[False, True], [True, False]]),
         (np.array([[0, 255], [127, 128]], np.uint8), [[False, True], [False, True]]),
@@ -186,7 +184,7 @@ def test_mask(write_image: WriteImage) -> None:
     ):
         mask = read_mask(write_image("mask.png", stored))
         assert mask.dtype == np.bool_
-        np.testing.assert_array_equal(mask, expected)
+        assert_array_equal(mask, expected)
 
 
 CUT_OUT = np.array([[0, 0, 255], [0, 200, 255]], np.uint8)
@@ -194,18 +192,18 @@ CUT_OUT = np.array([[0, 0, 255], [0, 200, 255]], np.uint8)
 
 @pytest.mark.parametrize("name", ["mask.png", "mask.tif"])
 @pytest.mark.parametrize("colour", [0, 90, 255])
-def test_a_cut_out_is_a_mask_whatever_its_colours(tmp_path: Path, name: str, colour: int) -> None:
+def test_a_cut_out_is_a_mask_whatever_its_colours(tmp_path, name, colour):
     for alpha, scale in ((CUT_OUT, 1), (CUT_OUT.astype(np.uint16) * 257, 257)):
         cv2.imwrite(
             str(tmp_path / name), np.dstack([np.full_like(alpha, colour * scale)] * 3 + [alpha])
         )
-        np.testing.assert_array_equal(read_mask(tmp_path / name), CUT_OUT > 127)
+        assert_array_equal(read_mask(tmp_path / name), CUT_OUT > 127)
     # Alpha that cuts nothing out leaves the mask to the colours.
     for nothing in (np.full((2, 3), 255), np.zeros((2, 3)), [[255, 254, 255], [250, 255, 255]]):
         cv2.imwrite(
             str(tmp_path / name), np.dstack([CUT_OUT] * 3 + [np.asarray(nothing, np.uint8)])
         )
-        np.testing.assert_array_equal(read_mask(tmp_path / name), CUT_OUT > 127)
+        assert_array_equal(read_mask(tmp_path / name), CUT_OUT > 127)
 
 
 RGB = np.random.default_rng(0).integers(0, 256, (7, 5, 3), np.uint8)
@@ -215,14 +213,12 @@ RGB = np.random.default_rng(0).integers(0, 256, (7, 5, 3), np.uint8)
     ("suffix", "options"), [(".bmp", {}), (".tga", {}), (".tga", {"compression": "tga_rle"})]
 )
 @pytest.mark.parametrize(("mode", "channels"), [("RGB", 3), ("L", 1), ("P", 3)])
-def test_pixels(
-    tmp_path: Path, suffix: str, options: dict[str, str], mode: str, channels: int
-) -> None:
+def test_pixels(tmp_path, suffix, options, mode, channels):
     picture = Image.fromarray(RGB).convert(mode)
     picture.save(tmp_path / f"image{suffix}", **options)
     path = tmp_path / f"image{suffix}"
     expected = np.asarray(picture.convert("RGB" if mode == "P" else mode)).reshape(7, 5, channels)
-    np.testing.assert_array_equal(decode_image(path), expected)
+    assert_array_equal(decode_image(path), expected)
     facts = read_header(path)
     assert (
         facts.size == ((7, 5, channels), 1) and facts.curve.curve == 1 and facts.white_level is None
@@ -230,7 +226,7 @@ def test_pixels(
 
 
 @pytest.mark.parametrize("suffix", [".bmp", ".tga"])
-def test_damage(tmp_path: Path, suffix: str) -> None:
+def test_damage(tmp_path, suffix):
     path = tmp_path / f"image{suffix}"
     Image.fromarray(RGB).save(path)
     whole = path.read_bytes()
@@ -240,7 +236,7 @@ def test_damage(tmp_path: Path, suffix: str) -> None:
             decode_image(path)
 
 
-def test_pictures_that_are_no_photographs_are_left_out(tmp_path: Path) -> None:
+def test_pictures_that_are_no_photographs_are_left_out(tmp_path):
     pictures, lights = np.full((6, 4, 5), 100, np.uint8), ring_lights(6)
     folder = write_capture(tmp_path / "owl", pictures, lights, names="owl.{}.png")
     Image.fromarray(RGB).save(folder / "owl.mask.bmp")
@@ -258,7 +254,7 @@ def test_pictures_that_are_no_photographs_are_left_out(tmp_path: Path) -> None:
     )
 
 
-def test_a_picture_of_another_size_without_a_light_is_left_out(tmp_path: Path) -> None:
+def test_a_picture_of_another_size_without_a_light_is_left_out(tmp_path):
     folder = write_capture(tmp_path / "owl", np.full((6, 4, 5), 100, np.uint8), ring_lights(6))
     Image.fromarray(RGB[:2]).save(folder / "thumb.png")
     capture = read_capture(folder)
@@ -295,7 +291,7 @@ def capture(folder: Path, *exposures: tuple[int, int] | None) -> Path:
     return folder
 
 
-def test_reading(tmp_path: Path) -> None:
+def test_reading(tmp_path):
     for suffix in ("jpg", "png"):
         assert find_exposure(read_header(write(tmp_path / f"a.{suffix}"))) == Exposure(
             1 / 60, 8.0, 100
@@ -303,19 +299,19 @@ def test_reading(tmp_path: Path) -> None:
         assert find_exposure(read_header(write(tmp_path / f"b.{suffix}", None))) is None
 
 
-def test_mixed_exposures_are_divided_out(tmp_path: Path) -> None:
+def test_mixed_exposures_are_divided_out(tmp_path):
     folder = capture(tmp_path / "mixed", (1, 60), (1, 60), (1, 30))
     for options in ({}, {"intensities": "equal"}):  # equal lamps do not make equal exposures
         source = open_capture(folder, CaptureOptions(**options))
         # The third image got twice the light of the others; the mean is 4 / 3.
-        np.testing.assert_allclose(source.light_intensities[:, 1], [0.75, 0.75, 1.5])
+        assert_allclose(source.light_intensities[:, 1], [0.75, 0.75, 1.5])
         assert (source.intensities_known, source.intensities_measured) == (bool(options), False)
         assert source.warnings[0].code == "exif_exposure"
         assert "from 1/60 s, f/8, ISO 100 to 1/30 s, f/8, ISO 100." in str(source.warnings[0])
     write(folder / "1.jpg", None)
     message = (
-        r"2\.jpg: found an exposure of 1/30 s, f/8, ISO 100, expected 1/60 s,"
-        r" f/8, ISO 100 as in 0\.jpg"
+        r"2\.jpg: found an exposure of 1/30 s, f/8, ISO 100, expected 1/60 s, f/8, ISO 100 as in "
+        r"0\.jpg"
     )
     with pytest.raises(InputError, match=message):
         open_capture(folder)
@@ -324,7 +320,7 @@ def test_mixed_exposures_are_divided_out(tmp_path: Path) -> None:
     assert open_capture(folder).n_lights == 3
 
 
-def test_exposures_that_are_one(tmp_path: Path) -> None:
+def test_exposures_that_are_one(tmp_path):
     open_capture(capture(tmp_path / "rounded", (1, 60), (10, 610), None))
     folder = capture(tmp_path / "balanced", (1, 60), (1, 60), (1, 60))
     write(folder / "1.jpg", (1, 120), iso=200)
@@ -342,9 +338,7 @@ def turned(folder: Path, name: str, orientation: int | None) -> Path:
 @pytest.mark.parametrize(
     ("tag", "expected"), [(None, UPRIGHT), (1, UPRIGHT), (6, 6), (42, UPRIGHT)]
 )
-def test_one_orientation(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tag: int | None, expected: int
-) -> None:
+def test_one_orientation(tmp_path, monkeypatch, tag, expected):
     """The pixels are not decoded, which takes seconds for 24 megapixels."""
     images = [
         turned(tmp_path, "a.jpg", tag),
@@ -355,7 +349,7 @@ def test_one_orientation(
     assert common_orientation([read_header(image) for image in images]) == expected
 
 
-def test_different_orientations_are_refused(tmp_path: Path) -> None:
+def test_different_orientations_are_refused(tmp_path):
     images = [
         turned(tmp_path, "a.jpg", None),
         turned(tmp_path, "b.jpg", 1),

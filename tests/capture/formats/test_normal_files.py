@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import scipy.io
 import tifffile
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
+from scenes import Floats
 from splinecli.capture import read_normal_map
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.capture.formats.numbers import read_mat
@@ -22,7 +24,7 @@ MASK[0] = False
 
 
 @pytest.fixture
-def normals() -> NDArray[np.float64]:
+def normals() -> Floats:
     """(4, 5, 3) unit normals, zero at [1, 2] and outside the mask."""
     field = (
         unit(np.random.default_rng(3).normal(size=(*SHAPE, 3)) * [1, 1, 0.2] + [0, 0, 1])
@@ -36,7 +38,7 @@ def read_normals(path: Path, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     return read_ground_truth(path, mask)[0]
 
 
-def write(path: Path, normals: NDArray[np.float64]) -> Path:
+def write(path: Path, normals: Floats) -> Path:
     match path.suffix:
         case ".mat":
             scipy.io.savemat(path, {"Normal_gt": normals})
@@ -51,12 +53,10 @@ def write(path: Path, normals: NDArray[np.float64]) -> Path:
 
 @pytest.mark.parametrize("name", ["a.mat", "a.npy", "a.txt", "a.tif"])
 @pytest.mark.parametrize("length", [1, 0.95, 40])
-def test_floating_point_sources(
-    tmp_path: Path, normals: NDArray[np.float64], name: str, length: float
-) -> None:
+def test_floating_point_sources(tmp_path, normals, name, length):
     read = read_normals(write(tmp_path / name, normals * length), MASK)
     assert read.dtype == np.float32
-    np.testing.assert_allclose(read, normals, atol=2e-7)
+    assert_allclose(read, normals, atol=2e-7)
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.tif", "a.npy", "a.mat"])
@@ -73,7 +73,7 @@ def test_pictures(write_image, tmp_path, normals, name, bits, error_deg):
     read = read_normals(path, MASK)
     assert not read[~has_normal].any()
     assert angle_between_deg(read[has_normal], normals[has_normal]).max() < error_deg
-    np.testing.assert_allclose(np.linalg.norm(read[has_normal], axis=-1), 1, atol=1e-6)
+    assert_allclose(np.linalg.norm(read[has_normal], axis=-1), 1, atol=1e-6)
 
 
 def test_what_is_gray_or_not_finite_or_outside_the_mask_is_no_ground_truth(
@@ -92,10 +92,10 @@ def test_what_is_gray_or_not_finite_or_outside_the_mask_is_no_ground_truth(
     assert np.count_nonzero(read.any(axis=2)) == 12
 
 
-def test_mat_with_another_key(tmp_path: Path, normals: NDArray[np.float64]) -> None:
+def test_mat_with_another_key(tmp_path, normals):
     path = tmp_path / "a.mat"
     scipy.io.savemat(path, {"N": normals, "mask": MASK})
-    np.testing.assert_allclose(read_normals(path, MASK), normals, atol=1e-6)
+    assert_allclose(read_normals(path, MASK), normals, atol=1e-6)
     for arrays, names in (({"N": normals, "M": normals}, "N, M"), ({"mask": MASK}, "none")):
         scipy.io.savemat(path, arrays)
         with pytest.raises(
@@ -104,21 +104,17 @@ def test_mat_with_another_key(tmp_path: Path, normals: NDArray[np.float64]) -> N
             read_normals(path, MASK)
 
 
-def test_text_with_commas_and_with_a_wrong_word(
-    tmp_path: Path, normals: NDArray[np.float64]
-) -> None:
+def test_text_with_commas_and_with_a_wrong_word(tmp_path, normals):
     path = tmp_path / "a.txt"
     rows = ["{:.9f}, {:.9f}, {:.9f}".format(*row) for row in normals.reshape(-1, 3)]
     path.write_text("\n".join(rows))
-    np.testing.assert_allclose(read_normals(path, MASK), normals, atol=1e-6)
+    assert_allclose(read_normals(path, MASK), normals, atol=1e-6)
     path.write_text("\n".join([*rows[:6], "0 up 1", *rows[7:]]))
     with pytest.raises(InputError, match=r'a\.txt:7: found "up", expected a number\.'):
         read_normals(path, MASK)
 
 
-def test_damaged_and_unknown_files_and_other_sizes(
-    tmp_path: Path, normals: NDArray[np.float64]
-) -> None:
+def test_damaged_and_unknown_files_and_other_sizes(tmp_path, normals):
     sizes = dict.fromkeys(
         ("a.mat", "a.npy", "a.tif"), "found a ground truth of 5 x 3 pixels, expected 5 x 4 as in"
     )
@@ -143,20 +139,16 @@ def test_damaged_and_unknown_files_and_other_sizes(
         read_normals(tmp_path / "a.exr", MASK)
 
 
-def test_rows_in_the_wrong_order_are_turned_over(
-    tmp_path: Path, normals: NDArray[np.float64]
-) -> None:
+def test_rows_in_the_wrong_order_are_turned_over(tmp_path, normals):
     # As in the normal.txt of DiLiGenT's Harvest: the rows alone, the vectors are right.
     path = write(tmp_path / "normal.txt", normals[::-1])
     read, upside_down = read_ground_truth(path, MASK)
     assert upside_down
-    np.testing.assert_allclose(read, normals, atol=2e-7)
+    assert_allclose(read, normals, atol=2e-7)
     assert not read_ground_truth(write(path, normals), MASK)[1]
     # A mask that is its own mirror image tells nothing.
     full = np.ones(SHAPE, bool)
-    np.testing.assert_allclose(
-        read_normals(write(path, normals[::-1]), full), normals[::-1], atol=2e-7
-    )
+    assert_allclose(read_normals(write(path, normals[::-1]), full), normals[::-1], atol=2e-7)
 
 
 def test_a_photograph_is_no_normal_map_and_a_huge_value_overflows_nothing(
@@ -170,12 +162,12 @@ def test_a_photograph_is_no_normal_map_and_a_huge_value_overflows_nothing(
             read_normal_map(write_image("photograph.png", picture))
     damaged = normals.astype(np.float32)
     damaged[3, 4] = 1e30
-    np.testing.assert_allclose(
+    assert_allclose(
         np.linalg.norm(read_normal_map(write(tmp_path / "a.npy", damaged))[3, 4]), 1, atol=1e-6
     )
 
 
-def test_matlab_s_small_whole_numbers_are_vectors(tmp_path: Path) -> None:
+def test_matlab_s_small_whole_numbers_are_vectors(tmp_path):
     """A double whose values are all whole lies as bytes; its class says that it is no picture."""
     plane = np.broadcast_to(np.array([0, 0, 1], np.uint8), (*SHAPE, 3))
     scipy.io.savemat(tmp_path / "a.mat", {"Normal_gt": plane})
@@ -183,14 +175,12 @@ def test_matlab_s_small_whole_numbers_are_vectors(tmp_path: Path) -> None:
     assert content[144] == 9  # class uint8, behind the header and two tags
     content[144] = 6  # double
     (tmp_path / "a.mat").write_bytes(content)
-    np.testing.assert_array_equal(read_normals(tmp_path / "a.mat", MASK), plane * MASK[..., None])
+    assert_array_equal(read_normals(tmp_path / "a.mat", MASK), plane * MASK[..., None])
 
 
 @pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("dtype", ["f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"])
-def test_matlab_s_numbers_are_those_that_scipy_reads(
-    tmp_path: Path, dtype: str, compressed: bool
-) -> None:
+def test_matlab_s_numbers_are_those_that_scipy_reads(tmp_path, dtype, compressed):
     values = np.random.default_rng(0).integers(0, 100, (*SHAPE, 3)).astype(dtype)
     arrays = {
         "a": np.eye(2),
@@ -201,27 +191,25 @@ def test_matlab_s_numbers_are_those_that_scipy_reads(
     }
     scipy.io.savemat(tmp_path / "a.mat", arrays, do_compression=compressed)
     read = read_mat(tmp_path / "a.mat", None)
-    np.testing.assert_array_equal(read, scipy.io.loadmat(tmp_path / "a.mat")["N"])
+    assert_array_equal(read, scipy.io.loadmat(tmp_path / "a.mat")["N"])
     assert read.dtype == values.dtype
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-def test_matlab_s_byte_orders_and_undefined_types(tmp_path: Path, compressed: bool) -> None:
+def test_matlab_s_byte_orders_and_undefined_types(tmp_path, compressed):
     """Of an undefined type, SciPy's reader ends the process."""
     values = np.arange(60.0).reshape(*SHAPE, 3)
     for order in "<>":
         path = write_mat(tmp_path / "a.mat", values, order, kind=9, compressed=compressed)
-        np.testing.assert_array_equal(read_mat(path, None), values)
-        np.testing.assert_array_equal(scipy.io.loadmat(path)["N"], values)
+        assert_array_equal(read_mat(path, None), values)
+        assert_array_equal(scipy.io.loadmat(path)["N"], values)
     for kind in (0, 8, 10, 14, 15, 16, 20, 200, 65_535):
         write_mat(path, values, "<", kind=kind, compressed=compressed)
         with pytest.raises(InputError, match="the MATLAB file is damaged and cannot be read"):
             read_normals(path, MASK)
 
 
-def write_mat(
-    path: Path, values: NDArray[np.float64], order: str, *, kind: int, compressed: bool
-) -> Path:
+def write_mat(path: Path, values: Floats, order: str, *, kind: int, compressed: bool) -> Path:
     """Write the variable N by the description of the format, its numbers with a type."""
 
     def element(kind: int, content: bytes) -> bytes:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from splinecli.capture import open_capture
@@ -141,7 +142,7 @@ def ramp(height: int = 30, width: int = 80) -> NDArray[Any]:
 
 @pytest.mark.usefixtures("needs_rawpy")
 @pytest.mark.parametrize("black", [(0, 0, 0, 0), (512, 512, 512, 512), (512, 516, 514, 509)])
-def test_values_are_proportional_to_light(tmp_path: Path, black: Sequence[int]) -> None:
+def test_values_are_proportional_to_light(tmp_path, black):
     light = ramp()
     once, twice = (
         decode_image(write_dng(tmp_path / f"{k}.dng", mosaic(k * light, black=black), black=black))
@@ -151,15 +152,13 @@ def test_values_are_proportional_to_light(tmp_path: Path, black: Sequence[int]) 
     # The borders of a bilinear interpolation are no ramp. Rounding on the sensor is 1/2 of 16383,
     # and its full scale is that of the highest black level: half a thousandth.
     inner = (slice(2, -2), slice(2, -2))
-    np.testing.assert_allclose(
-        once[inner] / 65535, light[inner][..., None] * np.ones(3), rtol=1e-3, atol=1e-4
-    )
+    assert_allclose(once[inner] / 65535, light[inner][..., None] * np.ones(3), rtol=1e-3, atol=1e-4)
     bright = once[inner] > 2000
-    np.testing.assert_allclose(twice[inner][bright] / once[inner][bright], 2, rtol=0.01)
+    assert_allclose(twice[inner][bright] / once[inner][bright], 2, rtol=0.01)
 
 
 @pytest.mark.usefixtures("needs_rawpy")
-def test_white_balance_and_orientation_of_the_shot_do_not_count(tmp_path: Path) -> None:
+def test_white_balance_and_orientation_of_the_shot_do_not_count(tmp_path):
     sensor = mosaic(ramp())
     first = decode_image(write_dng(tmp_path / "a.dng", sensor))
     for number, (neutral, orientation) in enumerate([((0.9, 1.0, 0.3), 1), ((0.5, 1.0, 0.6), 6)]):
@@ -175,9 +174,7 @@ def test_white_balance_and_orientation_of_the_shot_do_not_count(tmp_path: Path) 
     ("white", "black"),
     [(16383, (0,) * 4), (4095, (0,) * 4), (16383, (600,) * 4), (15000, (512, 530, 520, 500))],
 )
-def test_saturated_photosites_are_at_full_scale(
-    tmp_path: Path, white: int, black: Sequence[int]
-) -> None:
+def test_saturated_photosites_are_at_full_scale(tmp_path, white, black):
     light = np.full((40, 60), 0.98)
     light[10:20, 10:20] = 1
     light[25:35, 10:20] = 3
@@ -198,15 +195,15 @@ def test_channels_are_red_green_blue_of_the_camera_and_sensors_without_bayer_fil
     light = np.broadcast_to(colour, (30, 40, len(colour)))
     pixels = decode_image(write_dng(tmp_path / "a.dng", np.round(light * WHITE)))
     assert pixels.shape == light.shape
-    np.testing.assert_allclose(pixels / 65535, light, atol=1e-4)
+    assert_allclose(pixels / 65535, light, atol=1e-4)
     filtered = decode_image(
         write_dng(tmp_path / "b.dng", mosaic(np.broadcast_to(colour, (30, 40, 3))))
     )
-    np.testing.assert_allclose(filtered[10, 10] / 65535, np.broadcast_to(colour, 3), atol=1e-4)
+    assert_allclose(filtered[10, 10] / 65535, np.broadcast_to(colour, 3), atol=1e-4)
 
 
 @pytest.mark.usefixtures("without_rawpy")
-def test_rawpy_is_asked_for(tmp_path: Path) -> None:
+def test_rawpy_is_asked_for(tmp_path):
     path = write_dng(tmp_path / "a.nef", mosaic(ramp()))
     with pytest.raises(
         InputError,
@@ -216,7 +213,7 @@ def test_rawpy_is_asked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("needs_rawpy")
-def test_damaged_files(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_damaged_files(tmp_path, capfd):
     whole = write_dng(tmp_path / "whole.dng", mosaic(ramp())).read_bytes()
     for kept in (10, 200, 600, 3000):
         (tmp_path / "cut.dng").write_bytes(whole[:kept])
@@ -225,7 +222,7 @@ def test_damaged_files(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> Non
     assert capfd.readouterr() == ("", "")
 
 
-def test_one_file_of_each_photograph_counts(tmp_path: Path) -> None:
+def test_one_file_of_each_photograph_counts(tmp_path):
     """Ambient images may be RAW, masks not."""
     names = "img2.NEF IMG2.jpg img10.nef img10.tif img10.jpg img3.png img3.jpg notes.txt"
     for name in f"{names} ambient.NEF ambient.jpg mask.nef mask.png".split():
@@ -244,7 +241,7 @@ def test_one_file_of_each_photograph_counts(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("without_rawpy")
-def test_exposure_in_a_tiff_header_needs_no_rawpy(tmp_path: Path) -> None:
+def test_exposure_in_a_tiff_header_needs_no_rawpy(tmp_path):
     stated = write_dng(tmp_path / "a.dng", mosaic(ramp()), exposure=SHOT)
     assert find_exposure(read_header(stated)) == Exposure(*SHOT)
     assert find_exposure(read_header(write_dng(tmp_path / "b.dng", mosaic(ramp())))) is None
@@ -255,7 +252,7 @@ def test_exposure_in_a_tiff_header_needs_no_rawpy(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("needs_rawpy")
-def test_exposure_in_another_header(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_exposure_in_another_header(tmp_path, capfd):
     path = write_dng(tmp_path / "a.orf", mosaic(ramp()), exposure=SHOT, magic=b"IIRO")
     assert find_exposure(read_header(path)) == Exposure(*SHOT)
     path.write_bytes(path.read_bytes()[:2000])
@@ -265,7 +262,7 @@ def test_exposure_in_another_header(tmp_path: Path, capfd: pytest.CaptureFixture
 
 @pytest.mark.usefixtures("needs_rawpy")
 @pytest.mark.parametrize("thumbnail", [False, True])
-def test_the_white_level_is_that_of_the_developed_values(tmp_path: Path, thumbnail: bool) -> None:
+def test_the_white_level_is_that_of_the_developed_values(tmp_path, thumbnail):
     """The tags say 4095 of the sensor's values, or 8 bits of a thumbnail; the values read end at
     65535.
     """

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from scenes import png_chunk
+from scenes import png_chunk, write_image
 from splinecli.capture import open_capture
 from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.images import check_stored_size, decode_image
@@ -32,8 +32,8 @@ from splinecli.recipe import RecipeOptions, prepare_capture
 HUGE = 30_000
 SMALL = (16, 18)
 TOO_LARGE = (
-    r"(30|21)000 x (30|21)000 pixels, which takes \d+\.\d GB of memory;"
-    r" expected at most 400 megapixels"
+    r"(30|21)000 x (30|21)000 pixels, which takes \d+\.\d GB of memory; expected at most 400 "
+    r"megapixels"
 )
 MOST_GROWTH = 300 * 2**20
 
@@ -42,7 +42,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="measures memory
 
 def write_claim(path: Path, height: int, width: int) -> None:
     """A PNG that states a size and has no pixels. Whoever decodes it finds it damaged."""
-    cv2.imwrite(str(path), np.zeros(SMALL, np.uint8))
+    write_image(path, np.zeros(SMALL, np.uint8))
     content = path.read_bytes()
     header = struct.pack(">II", width, height) + content[24:29]
     path.write_bytes(content[:8] + png_chunk(b"IHDR", header) + png_chunk(b"IEND", b""))
@@ -118,7 +118,7 @@ def ground_truth(path: Path) -> object:
     return read_ground_truth(path, np.ones(SMALL, np.bool_))
 
 
-def test_images_too_large_to_read(tmp_path: Path) -> None:
+def test_images_too_large_to_read(tmp_path):
     write_claim(tmp_path / "a.png", 21_000, 21_000)
     write_jpeg(tmp_path / "a.jpg")
     write_tiff(tmp_path / "a.tif", HUGE, HUGE, zlib.compress(bytes(1000)))
@@ -126,12 +126,12 @@ def test_images_too_large_to_read(tmp_path: Path) -> None:
         refused(lambda name=name: decode_image(tmp_path / name), TOO_LARGE + ".*a smaller copy")
 
 
-def test_images_of_another_size_than_others_are_not_decoded(tmp_path: Path) -> None:
+def test_images_of_another_size_than_others_are_not_decoded(tmp_path):
     ball, capture = tmp_path / "ball", tmp_path / "capture"
     for folder in (ball, capture):
         folder.mkdir()
         for number in range(4):
-            cv2.imwrite(str(folder / f"{number}.png"), np.full(SMALL, 9 + number, np.uint8))
+            write_image(folder / f"{number}.png", np.full(SMALL, 9 + number, np.uint8))
     np.savetxt(capture / "lights.txt", [(0, 0, 1), (1, 0, 1), (0, 1, 1), (1, 1, 2)])
     write_claim(tmp_path / "large.png", 15_000, 15_000)
     np.save(tmp_path / "normals.npy", np.ones((*SMALL, 3)))
@@ -151,9 +151,7 @@ def test_images_of_another_size_than_others_are_not_decoded(tmp_path: Path) -> N
         prepare_capture(open_capture(capture))
 
 
-def test_a_capture_larger_than_the_memory_is_not_decoded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_capture_larger_than_the_memory_is_not_decoded(tmp_path, monkeypatch):
     """Six images of 361 megapixels: each would fit by itself."""
     np.savetxt(
         tmp_path / "lights.txt", [(0, 0, 1), (1, 0, 1), (0, 1, 1), (1, 1, 2), (0, 1, 2), (1, 0, 2)]
@@ -168,7 +166,7 @@ def test_a_capture_larger_than_the_memory_is_not_decoded(
 
 
 @pytest.mark.parametrize("size", [(754_974_744, 24), (2**31 - 1, 2**31 - 1)])
-def test_no_command_takes_memory_for_a_header(tmp_path: Path, size: tuple[int, int]) -> None:
+def test_no_command_takes_memory_for_a_header(tmp_path, size):
     lights = np.array([(0, 0, 1), (0.6, 0, 0.8), (0, 0.6, 0.8), (-0.6, 0, 0.8)])
     np.savetxt(tmp_path / "lights.txt", lights)
     for number in range(4):
@@ -182,15 +180,15 @@ def test_no_command_takes_memory_for_a_header(tmp_path: Path, size: tuple[int, i
     refused(lambda: open_capture(tmp_path).read_mask(size), match)
     refused(lambda: measure_light_intensities(find_ball_files(tmp_path), lights, "card"), match)
     for number in range(3):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full(SMALL, 99 + number, np.uint8))
+        write_image(tmp_path / f"{number}.png", np.full(SMALL, 99 + number, np.uint8))
     other = (
-        rf"3\.png: found an image of {size[1]} x {size[0]} pixels, expected"
-        rf" {SMALL[1]} x {SMALL[0]} as in 0\.png"
+        rf"3\.png: found an image of {size[1]} x {size[0]} pixels, expected {SMALL[1]} x "
+        rf"{SMALL[0]} as in 0\.png"
     )
     refused(lambda: describe_capture(InfoOptions(capture=tmp_path)), other)
 
 
-def test_content_that_expands_beyond_its_shape(tmp_path: Path) -> None:
+def test_content_that_expands_beyond_its_shape(tmp_path):
     write_tiff(tmp_path / "a.tif", *SMALL, zlib.compress(bytes(1 << 28), 1))
     refused(lambda: decode_image(tmp_path / "a.tif"), "the TIFF is damaged")
     write_mat(tmp_path / "a.mat", (*SMALL, 3), 1 << 28)
@@ -202,7 +200,7 @@ def test_content_that_expands_beyond_its_shape(tmp_path: Path) -> None:
     )
 
 
-def test_a_tiff_whose_tile_is_larger_than_its_picture(tmp_path: Path) -> None:
+def test_a_tiff_whose_tile_is_larger_than_its_picture(tmp_path):
     for name, side in (("small.tif", 128), ("a.tif", 21_000)):
         packer = zlib.compressobj(1)
         tile = b"".join(packer.compress(bytes(side)) for _ in range(side)) + packer.flush()
@@ -211,7 +209,7 @@ def test_a_tiff_whose_tile_is_larger_than_its_picture(tmp_path: Path) -> None:
     refused(lambda: decode_image(tmp_path / "a.tif"), "the TIFF is damaged")
 
 
-def test_headers_without_end(tmp_path: Path) -> None:
+def test_headers_without_end(tmp_path):
     """Each would take seconds to minutes to walk through. The steps that are read are counted in
     place of time.
     """
@@ -234,7 +232,7 @@ def test_headers_without_end(tmp_path: Path) -> None:
     refused(lambda: ground_truth(mat), "the MATLAB file is damaged")
 
 
-def test_arrays_too_large_to_read(tmp_path: Path) -> None:
+def test_arrays_too_large_to_read(tmp_path):
     with (tmp_path / "a.npy").open("wb") as file:
         header = {"descr": "<f8", "fortran_order": False, "shape": (HUGE, HUGE, 3)}
         np.lib.format.write_array_header_1_0(file, header)
@@ -251,9 +249,9 @@ def test_arrays_too_large_to_read(tmp_path: Path) -> None:
     refused(lambda: read_normal_map(tmp_path / "a.mat"), TOO_LARGE)
 
 
-def test_a_picture_with_gigabytes_behind_it(tmp_path: Path) -> None:
+def test_a_picture_with_gigabytes_behind_it(tmp_path):
     for name in ("a.png", "a.jpg", "a.tif"):
-        cv2.imwrite(str(tmp_path / name), np.ones(SMALL, np.uint8))
+        write_image(tmp_path / name, np.ones(SMALL, np.uint8))
         with (tmp_path / name).open("ab") as file:
             file.truncate(1 << 31)
         refused(
@@ -262,7 +260,7 @@ def test_a_picture_with_gigabytes_behind_it(tmp_path: Path) -> None:
         )
 
 
-def test_light_files_with_too_much_text(tmp_path: Path) -> None:
+def test_light_files_with_too_much_text(tmp_path):
     for text, message in (
         ("0 0 1" + " " * 1_000_000, "found 1.0 MB, expected a text file of at most 1.0"),
         ("1\n" * 60_000, "found 60001 lines, expected at most 50000"),
@@ -272,7 +270,7 @@ def test_light_files_with_too_much_text(tmp_path: Path) -> None:
         refused(lambda: read_light_directions(tmp_path / "a.txt"), message)
 
 
-def test_an_image_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_larger_than_the_memory(monkeypatch):
     monkeypatch.setattr("splinecli.capture.formats.images.available_memory", lambda: 1e9)
     check_stored_size((10_000, 10_000), 1, Path("a.png"))
     with pytest.raises(InputError, match=r"takes 1\.5 GB of memory, but 1\.0 GB are available"):

@@ -7,12 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 from torch import Tensor
 from torch.nn.functional import normalize, pad
+from torch.testing import assert_close
 
-from scenes import cap_directions, directions_at, ring_lights, spiral_lights
+from distributions import seeded
+from scenes import Floats, cap_directions, directions_at, ring_lights, spiral_lights
 from splinecli.estimate.fits.least_squares import (
     RIDGE,
     SMALLEST_VARIANCE,
@@ -25,30 +28,27 @@ from splinecli.estimate.fits.least_squares import (
     weighted_least_squares,
 )
 from splinecli.estimate.methods import MethodOptions, make_estimator
-from splinecli.maths.normals import angle_between_deg
+from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.robust import inverse_3x3, multiply_symmetric
 
 ROBUST = ("iw12", "l1", "ls-trimmed")
-Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
-def estimate(
-    name: str, observations: NDArray[np.floating], lights: NDArray[np.float64]
-) -> NDArray[np.floating]:
+def estimate(name: str, observations: NDArray[np.floating], lights: Floats) -> NDArray[np.floating]:
     return make_estimator(name, MethodOptions(device="cpu")).estimate(
         observations.astype(np.float32), lights
     )
 
 
 @pytest.mark.parametrize("name", ROBUST)
-def test_exact_on_matte_pixels(name: str, matte_pixels: Pixels) -> None:
+def test_exact_on_matte_pixels(name, matte_pixels):
     normals, lights, observations = matte_pixels
     # What is left is the rounding of the observations to float32, 6e-8 of each.
     assert angle_between_deg(estimate(name, observations, lights), normals).max() < 1e-3
 
 
 @pytest.mark.parametrize("name", ROBUST)
-def test_exact_in_spite_of_a_highlight_and_a_cast_shadow(name: str, matte_pixels: Pixels) -> None:
+def test_exact_in_spite_of_a_highlight_and_a_cast_shadow(name, matte_pixels):
     normals, lights, observations = matte_pixels
     spoilt = observations.copy()
     rows = np.arange(len(spoilt))
@@ -61,7 +61,7 @@ def test_exact_in_spite_of_a_highlight_and_a_cast_shadow(name: str, matte_pixels
     assert found.max() < 0.1
 
 
-def test_iw12_fixed_point(matte_pixels: Pixels) -> None:
+def test_iw12_fixed_point(matte_pixels):
     """The result solves eq. 11 for the variances that it gives rise to, written out with LAPACK."""
     _, lights, observations = matte_pixels
     rng = np.random.default_rng(2)
@@ -78,13 +78,13 @@ def test_iw12_fixed_point(matte_pixels: Pixels) -> None:
                 "fi,ij,fj->f", lights, posterior, lights
             )
             gamma = gamma.clip(SMALLEST_VARIANCE)
-        np.testing.assert_allclose(b, solution, rtol=1e-5)
+        assert_allclose(b, solution, rtol=1e-5)
 
 
-def test_l1_is_the_linear_programme_s_optimum() -> None:
+def test_l1_is_the_linear_programme_s_optimum():
     rng = np.random.default_rng(0)
     lights = rng.normal(size=(10, 3)) * (0.4, 0.4, 0.1) + (0, 0, 1)
-    lights /= np.linalg.norm(lights, axis=1, keepdims=True)
+    lights = unit(lights)
     observations = rng.uniform(size=(30, 10))
     found = solve_l1(torch.tensor(observations), torch.tensor(lights)).numpy()
     excess = []
@@ -100,7 +100,7 @@ def test_l1_is_the_linear_programme_s_optimum() -> None:
 
 
 @pytest.mark.parametrize(("count", "dropped"), [(3, 0), (4, 0), (5, 0), (6, 1), (10, 2), (96, 19)])
-def test_trimmed_ends(count: int, dropped: int) -> None:
+def test_trimmed_ends(count, dropped):
     """Moving a trimmed observation further out changes nothing; moving the next one does."""
     rng = np.random.default_rng(0)
     lights = torch.tensor(rng.normal(size=(count, 3)))
@@ -115,21 +115,21 @@ def test_trimmed_ends(count: int, dropped: int) -> None:
     assert not torch.allclose(solve_trimmed(outer, lights), before)
 
 
-def test_lights_that_span_a_plane_or_a_line_give_finite_normals() -> None:
+def test_lights_that_span_a_plane_or_a_line_give_finite_normals():
     """Three directions, each many times: under IW12's weights one of them may drop out, then
     another.
     """
     rng = np.random.default_rng(0)
     for spanned in (1, 2, 3):
         rows = rng.normal(size=(spanned, 3)) * (0.4, 0.4, 0.1) + (0, 0, 1)
-        lights = (rows / np.linalg.norm(rows, axis=1, keepdims=True))[np.arange(12) % spanned]
+        lights = unit(rows)[np.arange(12) % spanned]
         observations = rng.uniform(size=(2000, 12)).astype(np.float32)
         for name in ROBUST:
             found = estimate(name, observations, lights)
-            np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
+            assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
 
 
-def test_weighted_step_against_lapack() -> None:
+def test_weighted_step_against_lapack():
     rng = np.random.default_rng(0)
     lights, observations = rng.normal(size=(7, 3)), rng.uniform(size=(5, 7))
     weight = 10.0 ** rng.uniform(-6, 6, (5, 7))
@@ -139,12 +139,10 @@ def test_weighted_step_against_lapack() -> None:
     for i in range(5):
         root = np.sqrt(weight[i])[:, None]
         expected = np.linalg.lstsq(root * lights, root[:, 0] * observations[i], rcond=None)[0]
-        np.testing.assert_allclose(solution[i], expected, rtol=1e-6)
+        assert_allclose(solution[i], expected, rtol=1e-6)
         inverse = np.linalg.inv((root * lights).T @ (root * lights))
         entries = inverse[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-        np.testing.assert_allclose(
-            covariance[:, i], entries, rtol=1e-5, atol=1e-9 * np.trace(inverse)
-        )
+        assert_allclose(covariance[:, i], entries, rtol=1e-5, atol=1e-9 * np.trace(inverse))
 
 
 def normals_under(limit_deg: float, count: int) -> Tensor:
@@ -165,17 +163,17 @@ def to_unit_scale(observations: Tensor) -> Tensor:
     return observations / observations.amax(dim=1, keepdim=True)
 
 
-def test_pixels_without_shadow_are_recovered_with_their_albedo() -> None:
+def test_pixels_without_shadow_are_recovered_with_their_albedo():
     truth, lights = normals_under(30, 500), ring(10, 40)
     observations = to_unit_scale(truth @ lights.T)
     assert observations.min() > 0.05  # no light is taken for a shadow
     scaled = fit_lambertian(observations, lights)
     assert error_deg(scaled, truth).max() < 0.1
     albedo = 1 / (truth @ lights.T).amax(dim=1)
-    torch.testing.assert_close(scaled.norm(dim=1), albedo, rtol=1e-3, atol=0)
+    assert_close(scaled.norm(dim=1), albedo, rtol=1e-3, atol=0)
 
 
-def test_shadows_over_a_third_of_the_lights_are_seen_through() -> None:
+def test_shadows_over_a_third_of_the_lights_are_seen_through():
     truth, lights = normals_under(25, 500), ring(12, 40)
     observations = truth @ lights.T
     # Four neighbours of the ring lie in cast shadow, elsewhere for every pixel.
@@ -187,7 +185,7 @@ def test_shadows_over_a_third_of_the_lights_are_seen_through() -> None:
     assert error_deg(fit_lambertian(observations, lights), truth).max() < 0.5
 
 
-def test_a_highlight_counts_less_than_in_least_squares() -> None:
+def test_a_highlight_counts_less_than_in_least_squares():
     truth, lights = normals_under(20, 200), ring(12, 40)
     observations = truth @ lights.T
     observations[:, 3] *= 2
@@ -201,7 +199,7 @@ ROWS, COLUMNS = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
 """Places of xx, yy, zz, xy, xz, yz in a matrix."""
 
 
-def positive_matrices(count: int, rank: int = 3) -> NDArray[np.float64]:
+def positive_matrices(count: int, rank: int = 3) -> Floats:
     factors = np.random.default_rng(0).normal(size=(count, 3, rank))
     return np.asarray(factors @ factors.transpose(0, 2, 1))
 
@@ -217,15 +215,15 @@ def inverse(matrices: NDArray[Any], smallest: float, library: str) -> NDArray[An
 
 
 @pytest.mark.parametrize("library", ["numpy", "torch"])
-def test_inverse(library: str) -> None:
+def test_inverse(library):
     matrices = positive_matrices(1000)
     expected = np.linalg.inv(matrices)
     size = np.abs(expected).max(axis=(1, 2), keepdims=True)
     # The worst of a thousand such matrices has a condition number of about 1e7.
-    np.testing.assert_allclose(inverse(matrices, 1e-14, library) / size, expected / size, atol=1e-8)
+    assert_allclose(inverse(matrices, 1e-14, library) / size, expected / size, atol=1e-8)
 
 
-def test_numpy_and_torch_agree_to_the_last_bit() -> None:
+def test_numpy_and_torch_agree_to_the_last_bit():
     matrices = positive_matrices(1000)
     assert (
         inverse(matrices, 1e-12, "numpy").tobytes() == inverse(matrices, 1e-12, "torch").tobytes()
@@ -234,20 +232,20 @@ def test_numpy_and_torch_agree_to_the_last_bit() -> None:
 
 @pytest.mark.parametrize("rank", [0, 1, 2])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_inverse_of_a_singular_matrix_is_positive(rank: int, dtype: type) -> None:
+def test_inverse_of_a_singular_matrix_is_positive(rank, dtype):
     inverted = inverse(positive_matrices(100, rank).astype(dtype), 1e-6, "numpy")
     assert np.isfinite(inverted).all()
     assert (np.diagonal(inverted, axis1=1, axis2=2) > 0).all()
 
 
-def test_product_with_a_vector() -> None:
+def test_product_with_a_vector():
     matrices, vectors = positive_matrices(50), np.random.default_rng(1).normal(size=(50, 3))
     entries = [matrices[:, i, j] for i, j in zip(ROWS, COLUMNS, strict=True)]
     found, expected = (
         multiply_symmetric(entries, vectors.T),
         np.einsum("pij,pj->ip", matrices, vectors),
     )
-    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 
 LIGHTS = torch.tensor(spiral_lights(10, 55))
@@ -258,14 +256,14 @@ def noisy_pixels(lights: Tensor, noise: float) -> tuple[Tensor, Tensor]:
     """Normals (2000, 3) of matte pixels that no light leaves dark, and their observations (2000,
     F).
     """
-    generator = torch.Generator().manual_seed(2)
+    generator = seeded(2)
     across = 0.6 * (torch.rand(2000, 2, generator=generator, dtype=torch.float64) - 0.5)
     normals = normalize(pad(across, (0, 1), value=1.0), dim=1)
     errors = torch.randn(2000, len(lights), generator=generator, dtype=torch.float64)
     return normals, 0.4 * normals @ lights.T + 0.4 * noise * errors
 
 
-def test_the_change_is_half_the_difference_of_two_halves() -> None:
+def test_the_change_is_half_the_difference_of_two_halves():
     """On a ring, the sums over either half are the same. So least squares with one half is the
     oracle.
     """
@@ -277,7 +275,7 @@ def test_the_change_is_half_the_difference_of_two_halves() -> None:
     )
     expected = (first - second) / 2
     found = compare_halves(observations, lights, alternating_signs(lights))
-    torch.testing.assert_close(found.normals, normalize(first + second, dim=1), atol=1e-5, rtol=0)
+    assert_close(found.normals, normalize(first + second, dim=1), atol=1e-5, rtol=0)
     # Along the normal, it is the albedo's.
     change = found.change - (found.change * found.normals).sum(dim=1, keepdim=True) * found.normals
     differences = ((change - expected).abs().amax(), (change + expected).abs().amax())
@@ -286,7 +284,7 @@ def test_the_change_is_half_the_difference_of_two_halves() -> None:
 
 @pytest.mark.parametrize("square", [False, True])
 @pytest.mark.parametrize("count", [4, 5, 10, 40])
-def test_noise_is_as_large_as_the_random_errors(count: int, square: bool) -> None:
+def test_noise_is_as_large_as_the_random_errors(count, square):
     """Also on a ring of four lights, whose residuals alternate as the signs of the halves do."""
     ring = directions_at(2 * np.pi * np.arange(count) / count, np.radians(35))
     lights = torch.tensor(ring if square else spiral_lights(count, 55))
@@ -298,7 +296,7 @@ def test_noise_is_as_large_as_the_random_errors(count: int, square: bool) -> Non
     assert noise == pytest.approx(float(error), rel=0.07)  # means of 2,000 squares
 
 
-def test_errors_that_all_pixels_share_are_no_noise() -> None:
+def test_errors_that_all_pixels_share_are_no_noise():
     """Wrong intensities turn all normals alike. What the halves disagree about is as smooth as the
     normals are.
     """
@@ -309,18 +307,18 @@ def test_errors_that_all_pixels_share_are_no_noise() -> None:
     assert (noise - fitted).abs().mean() < 0.1 * noise.abs().mean()
 
 
-def test_the_order_of_the_lights_changes_nothing() -> None:
+def test_the_order_of_the_lights_changes_nothing():
     _, observations = noisy_pixels(LIGHTS, 0.01)
     found = compare_halves(observations, LIGHTS, SIGNS)
-    order = torch.randperm(10, generator=torch.Generator().manual_seed(3))
+    order = torch.randperm(10, generator=seeded(3))
     for other in (
         compare_halves(observations[:, order], LIGHTS[order], alternating_signs(LIGHTS[order])),
         compare_halves(observations, LIGHTS.expand(len(observations), -1, -1), SIGNS),
     ):
-        torch.testing.assert_close(tuple(other), tuple(found))
+        assert_close(tuple(other), tuple(found))
 
 
-def test_three_lights_and_black_pixels_disagree_about_nothing() -> None:
+def test_three_lights_and_black_pixels_disagree_about_nothing():
     found = compare_halves(noisy_pixels(LIGHTS[:3], 0.01)[1], LIGHTS[:3], SIGNS[:3])
     assert found.change.abs().max() < 1e-6
     assert found.noise.isfinite().all()

@@ -10,14 +10,14 @@ import quadprog
 import torch
 from numpy.typing import NDArray
 
-from scenes import cap_directions, halfway
+from scenes import Floats, cap_directions, halfway
 from splinecli.estimate.fits.ia14 import fit_ia14
 from splinecli.estimate.fits.st14 import solve_st14
 from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.maths.normals import angle_between_deg
 
-Array = NDArray[np.float64]
+Array = Floats
 
 
 def half_cosines(normals: Array, lights: Array) -> tuple[Array, Array]:
@@ -67,14 +67,14 @@ def with_highlights(observations: Array, untouched: int) -> Array:
     return observations * (1 + gain * (rank >= untouched))
 
 
-def test_exact_under_its_model() -> None:
+def test_exact_under_its_model():
     assert OBSERVATIONS.min() > 0
     # The prior weighs no more than the noise it is left with, which is rounding.
     assert angle_between_deg(solved(OBSERVATIONS, LIGHTS), TRUTH).max() < 0.005
     assert angle_between_deg(estimate(OBSERVATIONS, LIGHTS), TRUTH).max() < 0.02
 
 
-def test_highlights_in_the_brightest_observations_change_nothing() -> None:
+def test_highlights_in_the_brightest_observations_change_nothing():
     bright = with_highlights(OBSERVATIONS, untouched=60)
     assert angle_between_deg(LeastSquares().estimate(bright, LIGHTS), TRUTH).mean() > 20
     # They raise the threshold of shadows, so fewer observations are kept than without them.
@@ -82,7 +82,7 @@ def test_highlights_in_the_brightest_observations_change_nothing() -> None:
 
 
 @pytest.mark.parametrize(("count", "cast"), [(4, 0.0), (6, 0.0), (10, 0.0), (64, 0.1)])
-def test_exact_on_lambertian_scenes_with_shadows(count: int, cast: float) -> None:
+def test_exact_on_lambertian_scenes_with_shadows(count, cast):
     lights, truth = cap_directions(count, 70, 3, even=True), cap_directions(300, 60, 4, even=True)
     observations = np.maximum(truth @ lights.T, 0)
     assert (observations == 0).any()
@@ -94,7 +94,7 @@ def test_exact_on_lambertian_scenes_with_shadows(count: int, cast: float) -> Non
 
 
 @pytest.mark.parametrize(("count", "untouched"), [(10, 8), (96, 60)])
-def test_noise_and_highlights_cost_less_than_in_least_squares(count: int, untouched: int) -> None:
+def test_noise_and_highlights_cost_less_than_in_least_squares(count, untouched):
     lights = cap_directions(count, 38, 3, even=True)
     noise = np.random.default_rng(6).normal(1, 0.01, (len(TRUTH), count))
     observations = with_highlights(bipolynomial(TRUTH, lights) * noise, untouched)
@@ -105,7 +105,7 @@ def test_noise_and_highlights_cost_less_than_in_least_squares(count: int, untouc
     )
 
 
-Array = NDArray[np.float64]
+Array = Floats
 ON_CPU = MethodOptions(device="cpu")
 
 
@@ -128,7 +128,7 @@ def rendered(normals: Array, lights: Array, seed: int) -> Array:
     return observations / observations.max(axis=1, keepdims=True)
 
 
-def test_lambertian_is_exact() -> None:
+def test_lambertian_is_exact():
     for count in (4, 10, 96):
         truth, lights = (
             cap_directions(300, 70, 0, even=True),
@@ -168,7 +168,7 @@ def objective_of(
 
 @pytest.mark.parametrize("count", [10, 96])
 @pytest.mark.parametrize("kind", ["random", "rendered"])
-def test_optimum_is_the_librarys(kind: str, count: int) -> None:
+def test_optimum_is_the_librarys(kind, count):
     lights = cap_directions(count, 60, 5, even=True)
     truth = cap_directions(100, 60, 6, even=True)
     if kind == "random":

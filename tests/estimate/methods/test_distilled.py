@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from torch import Tensor
 
+from distributions import seeded
 from scenes import Teacher, cap_directions, shade, spiral_lights
 from splinecli.errors import UsageError
 from splinecli.estimate.methods.distilled import DistilledEstimator, Perceptron, distil, draw_sample
@@ -86,7 +88,7 @@ def sure(observations: NDArray[np.float32], normals: Floats, degrees: float = 2)
     return Remembering(observations, normals, np.tile(log_median(degrees), (len(normals), 1)))
 
 
-def test_it_follows_the_truth_through_the_noise_of_its_teacher() -> None:
+def test_it_follows_the_truth_through_the_noise_of_its_teacher():
     normals, observations = glossy()
     teacher = sure(observations, noisy(normals, 4), 4)
     found = learn(teacher)
@@ -100,13 +102,11 @@ def test_it_follows_the_truth_through_the_noise_of_its_teacher() -> None:
     assert told.expected_deg == pytest.approx(4, abs=0.2)
     assert told.held_out == pytest.approx(told.sample / 8, abs=1)
     assert teacher.asked == told.sample + found.n_unlike < 1800
-    np.testing.assert_allclose(
-        np.linalg.norm(found.estimate(observations, LIGHTS), axis=1), 1, atol=1e-5
-    )
+    assert_allclose(np.linalg.norm(found.estimate(observations, LIGHTS), axis=1), 1, atol=1e-5)
 
 
 @pytest.mark.parametrize("followed", [True, False])
-def test_it_learns_a_capture_anew_whose_observations_changed(followed: bool) -> None:
+def test_it_learns_a_capture_anew_whose_observations_changed(followed):
     """The teacher says something else of the new observations. If that is noise,
     the teacher stays.
     """
@@ -123,7 +123,7 @@ def test_it_learns_a_capture_anew_whose_observations_changed(followed: bool) -> 
         assert anew is teacher
 
 
-def test_lamps_near_a_plane_of_bumps() -> None:
+def test_lamps_near_a_plane_of_bumps():
     """Lamps at two widths: their light turns by 25 degrees over the plane, which no single set of
     lights explains.
     """
@@ -131,7 +131,7 @@ def test_lamps_near_a_plane_of_bumps() -> None:
     points = np.concatenate((rng.uniform(-1, 1, (8000, 2)), np.zeros((8000, 1))), axis=1)
     normals = cap_directions(8000, 40)[rng.permutation(8000)]
     towards = 4 * LIGHTS - points[:, None]
-    directions = towards / np.linalg.norm(towards, axis=2, keepdims=True)
+    directions = unit(towards)
     shading = np.einsum("pfc,pc->pf", directions, normals).clip(0)
     observations = (shading + 0.3 * shading**8).astype(np.float32)
     teacher = sure(observations, noisy(normals, 4), 4)
@@ -146,8 +146,8 @@ def test_lamps_near_a_plane_of_bumps() -> None:
 
 
 @pytest.mark.parametrize("near", [False, True])
-def test_gradient_against_autograd(near: bool) -> None:
-    generator = torch.Generator().manual_seed(3)
+def test_gradient_against_autograd(near):
+    generator = seeded(3)
     normals, observations = glossy(300)
     lights = torch.tensor(LIGHTS, dtype=torch.float32).expand(*(len(normals),) * near, -1, -1)
     perceptron = Perceptron(lights, 16, generator)
@@ -167,7 +167,7 @@ def test_gradient_against_autograd(near: bool) -> None:
         torch.testing.assert_close(gradient, parameter.grad, rtol=1e-4, atol=1e-6)
 
 
-def test_it_learns_where_its_teacher_is_unsure() -> None:
+def test_it_learns_where_its_teacher_is_unsure():
     normals = cap_directions(6000, 50)
     dull = np.arange(6000) % 2 == 0
     observations = (shade(normals, LIGHTS) ** np.where(dull, 1, 2)[:, None]).astype(np.float32)
@@ -179,7 +179,7 @@ def test_it_learns_where_its_teacher_is_unsure() -> None:
     assert np.abs(learned[~dull].mean() - truth[~dull].mean()) < 0.1
 
 
-def test_a_rare_kind_of_pixel_is_left_to_the_teacher() -> None:
+def test_a_rare_kind_of_pixel_is_left_to_the_teacher():
     """Fails if the sample is even, and if the perceptron estimates all other pixels."""
     normals, observations = glossy(20_000)
     rare = np.arange(20_000) % 1000 == 3
@@ -193,16 +193,16 @@ def test_a_rare_kind_of_pixel_is_left_to_the_teacher() -> None:
     assert found.report()["unlike_pixels"] == found.n_unlike
 
 
-def test_dark_pixels_have_no_normal() -> None:
+def test_dark_pixels_have_no_normal():
     normals, observations = glossy(3000)
     observations[::100] = 0
     teacher = sure(observations, normals)
     estimate, errors = learn(teacher).estimate_with_error(observations, LIGHTS)
-    np.testing.assert_array_equal(estimate[::100], np.tile((0, 0, 1), (30, 1)))
-    np.testing.assert_allclose(errors[::100], np.tile(UNKNOWN_ERROR, (30, 1)), rtol=1e-6)
+    assert_array_equal(estimate[::100], np.tile((0, 0, 1), (30, 1)))
+    assert_allclose(errors[::100], np.tile(UNKNOWN_ERROR, (30, 1)), rtol=1e-6)
 
 
-def test_the_same_seed_gives_the_same_and_no_other_draws_change() -> None:
+def test_the_same_seed_gives_the_same_and_no_other_draws_change():
     normals, observations = glossy(3000)
     teacher = sure(observations, normals)
     torch.manual_seed(3)
@@ -211,12 +211,12 @@ def test_the_same_seed_gives_the_same_and_no_other_draws_change() -> None:
     first, again, other = (
         learn(teacher, SMALL, seed=seed).estimate(observations, LIGHTS) for seed in (1, 1, 2)
     )
-    np.testing.assert_array_equal(first, again)
+    assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-4
     assert torch.equal(torch.rand(3), expected)
 
 
-def test_too_few_pixels() -> None:
+def test_too_few_pixels():
     """The sample is half of the lit pixels at most: of 127, 63."""
     normals, observations = glossy(127)
     teacher = sure(observations, normals)
@@ -224,7 +224,7 @@ def test_too_few_pixels() -> None:
         learn(teacher)
 
 
-def test_sizes_grow_with_the_capture() -> None:
+def test_sizes_grow_with_the_capture():
     assert student_sizes(100_000)[0] == StudentSize(sample=10_000, steps=833, width=96)
     assert student_sizes(1_600_000)[0].sample == 20_000
     assert student_sizes(8_000)[0].sample == 2000
@@ -236,49 +236,44 @@ def test_sizes_grow_with_the_capture() -> None:
 
 def clusters() -> Tensor:
     """Return 5,000 features near the origin, 20 far away near (9, 0, 0), and one at (0, 30, 0)."""
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     points = torch.randn(5021, 3, generator=generator) * 0.3
     points[5000:, 0] += 9
     points[5020] = torch.tensor((0.0, 30.0, 0.0))
     return points
 
 
-def test_rare_kinds_are_in_the_sample() -> None:
-    sample = draw_sample(clusters(), 1200, torch.Generator().manual_seed(0))
+def test_rare_kinds_are_in_the_sample():
+    sample = draw_sample(clusters(), 1200, seeded(0))
     rows = sample.rows.tolist()
     assert len(set(rows)) == len(rows)
     assert len(rows) == 1200
     assert set(range(5000, 5021)) <= set(rows)
 
 
-def test_the_first_rows_are_an_even_sample() -> None:
+def test_the_first_rows_are_an_even_sample():
     """The far cluster has its share of them, 0.4 %, and not more."""
     counts = [
-        int(
-            (
-                draw_sample(clusters(), 1200, torch.Generator().manual_seed(seed)).rows[:600]
-                >= 5000
-            ).sum()
-        )
+        int((draw_sample(clusters(), 1200, seeded(seed)).rows[:600] >= 5000).sum())
         for seed in range(8)
     ]
     # Poisson of mean 20.1 in all: three standard deviations either way.
     assert 7 < sum(counts) < 34
 
 
-def test_rare_groups_and_strangers_are_unlike() -> None:
+def test_rare_groups_and_strangers_are_unlike():
     points = clusters()
-    sample = draw_sample(points, 1200, torch.Generator().manual_seed(0), rare_share=0.005)
+    sample = draw_sample(points, 1200, seeded(0), rare_share=0.005)
     unlike = sample.unlike(points)
     assert unlike[5020]
     assert unlike.float().mean() <= 0.005
-    none_rare = draw_sample(points, 1200, torch.Generator().manual_seed(0))
+    none_rare = draw_sample(points, 1200, seeded(0))
     assert not none_rare.unlike(points).any()
     assert none_rare.unlike(torch.tensor([[0.0, 0.0, -30.0]])).all()
 
 
-def test_equal_pixels_are_one_group() -> None:
-    sample = draw_sample(torch.ones(500, 4), 100, torch.Generator().manual_seed(0))
+def test_equal_pixels_are_one_group():
+    sample = draw_sample(torch.ones(500, 4), 100, seeded(0))
     assert len(sample.rows) == 100
     assert sample.reach == 0
     assert not sample.unlike(torch.ones(3, 4)).any()

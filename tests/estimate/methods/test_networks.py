@@ -14,7 +14,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from scenes import directions_at, evaluate, shade, sphere, spiral_lights
+from scenes import Floats, Mask, directions_at, evaluate, read_json, shade, sphere, spiral_lights
 from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.estimate.methods.batched import NetworkEstimator, context_sample, rotations_of
 from splinecli.estimate.methods.estimator import CONFIDENT_DEG
@@ -30,11 +30,11 @@ from splinecli.workshop.training.objective import to_pixel_frame
 from tiny_networks import random_network
 
 
-def pixels(count: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+def pixels(count: int) -> tuple[NDArray[np.float32], Floats]:
     rng = np.random.default_rng(0)
     lights = rng.normal(size=(10, 3)) + np.array((0, 0, 3))
     observations = rng.uniform(size=(count, 10)).astype(np.float32)
-    return observations, lights / np.linalg.norm(lights, axis=1, keepdims=True)
+    return observations, unit(lights)
 
 
 def estimator(network: SplineNet | None = None, **options: Any) -> NetworkEstimator:
@@ -42,7 +42,7 @@ def estimator(network: SplineNet | None = None, **options: Any) -> NetworkEstima
     return NetworkEstimator("spline-net", loaded, **{"precision": "float32", **options})
 
 
-def test_bfloat16_costs_little() -> None:
+def test_bfloat16_costs_little():
     observations, lights = pixels(50)
     exact = estimator().estimate(observations, lights)
     coarse = estimator(precision="bfloat16").estimate(observations, lights)
@@ -51,7 +51,7 @@ def test_bfloat16_costs_little() -> None:
     assert 0 < error.max() < 1
 
 
-def test_rotations_of_a_canonical_network() -> None:
+def test_rotations_of_a_canonical_network():
     assert rotations_of(1, canonical=True) == [(0, False)]
     assert rotations_of(2, canonical=True) == [(0, False), (0, True)]
     assert rotations_of(4, canonical=True) == [(-10, False), (-10, True), (10, False), (10, True)]
@@ -62,7 +62,7 @@ def test_rotations_of_a_canonical_network() -> None:
         several = rotations_of(rotations, canonical=True)
         assert len(set(several)) == rotations
         # Training turns by up to 15 degrees.
-        assert max(abs(turn) for turn, _ in several) <= 15
+        assert max(abs(turn) for turn, _ in several) <= 15  # type: ignore[operator]
 
 
 SEES = {"map_size": 16, "set_width": 16, "set_layers": 1, "error_head": True, "sees_capture": True}
@@ -74,7 +74,7 @@ QUARTER, MIRROR = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.diag((1.0, 
     ("settings", "turn", "symmetric_from"),
     [(PAPER, QUARTER, 4), ({}, MIRROR, 2), (SEES, MIRROR, 2)],
 )
-def test_rotations_make_a_network_symmetric(settings, turn, symmetric_from) -> None:
+def test_rotations_make_a_network_symmetric(settings, turn, symmetric_from):
     """Four make the paper's fourfold symmetric, for turned lights only change their order; two make
     ours a mirror.
     """
@@ -88,7 +88,7 @@ def test_rotations_make_a_network_symmetric(settings, turn, symmetric_from) -> N
         assert np.allclose(there, here @ turn.T, atol=1e-4) == (rotations > 1)
 
 
-def test_progress_changes_no_bit() -> None:
+def test_progress_changes_no_bit():
     observations, lights = pixels(150)
     network = estimator(batch_size=100)
     done: list[int] = []
@@ -97,16 +97,16 @@ def test_progress_changes_no_bit() -> None:
     assert done == [100, 50]
 
 
-def lighting_at(observations: NDArray[np.float32], lights: NDArray[np.float64]) -> LightingAt:
+def lighting_at(observations: NDArray[np.float32], lights: Floats) -> LightingAt:
     return lambda rows: PixelLighting(observations[rows], lights)
 
 
-def row(n_pixels: int) -> NDArray[np.bool_]:
+def row(n_pixels: int) -> Mask:
     """Return a mask (1, P) that fills its image, so that no pixel is at an outline."""
     return np.ones((1, n_pixels), np.bool_)
 
 
-def test_pixels_see_their_capture_and_not_their_tile() -> None:
+def test_pixels_see_their_capture_and_not_their_tile():
     observations, lights = pixels(600)
     network = estimator(random_network(**SEES), batch_size=100)
     whole = network.bind(lighting_at(observations, lights), row(600))
@@ -122,7 +122,7 @@ def test_pixels_see_their_capture_and_not_their_tile() -> None:
     assert whole is not network and network._contexts == [None]
 
 
-def test_a_black_background_says_nothing_of_the_object() -> None:
+def test_a_black_background_says_nothing_of_the_object():
     observations, lights = pixels(200)
     network = estimator(random_network(**SEES))
     expected = network.estimate(observations, lights)
@@ -135,14 +135,14 @@ def test_a_black_background_says_nothing_of_the_object() -> None:
     assert np.array_equal(network.estimate(0 * dark, lights), np.tile((0, 0, 1), (800, 1)))
 
 
-def sampled(brightness: NDArray[np.float64], mask: NDArray[np.bool_]) -> list[float]:
+def sampled(brightness: Floats, mask: Mask) -> list[float]:
     """Return the brightness (H, W) of the pixels that are sampled from a capture."""
     observations = np.repeat(brightness[mask].astype(np.float32)[:, None], 4, axis=1)
     found, _ = context_sample(lighting_at(observations, spiral_lights(4)), mask)
     return found[:, 0].tolist()
 
 
-def test_outline_pixels_darker_than_their_inner_neighbours_are_not_sampled() -> None:
+def test_outline_pixels_darker_than_their_inner_neighbours_are_not_sampled():
     mask = np.zeros((14, 14), np.bool_)
     mask[:12, 1:13] = True  # cut by the upper border of the image
     brightness = np.ones((14, 14))
@@ -159,12 +159,12 @@ def test_outline_pixels_darker_than_their_inner_neighbours_are_not_sampled() -> 
     assert len(sampled(brightness, mask)) == mask.sum()
 
 
-def test_outline_pixels_that_the_object_covers_only_in_part_do_not_affect_the_others() -> None:
+def test_outline_pixels_that_the_object_covers_only_in_part_do_not_affect_the_others():
     """Without context, all pixels of a call are sampled."""
     size, factor, lights = 32, 8, spiral_lights(10)
     normals, inside = sphere(size * factor)
 
-    def photographed(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    def photographed(values):
         return np.asarray(
             (values * inside[..., None]).reshape(size, factor, size, factor, -1).mean(axis=(1, 3))
         )
@@ -184,7 +184,7 @@ def test_outline_pixels_that_the_object_covers_only_in_part_do_not_affect_the_ot
     assert whole < 0.6 * alone
 
 
-def test_methods_that_see_no_capture_stay_as_they_are() -> None:
+def test_methods_that_see_no_capture_stay_as_they_are():
     observations, lights = pixels(20)
     for method in (estimator(), make_estimator("ls")):
         assert method.bind(lighting_at(observations, lights), row(20)) is method
@@ -221,7 +221,7 @@ OBJECTS = pytest.mark.parametrize(("place", "name"), [(0, "ballPNG"), (1, "catPN
 
 
 @OBJECTS
-def test_all_lights(shared_data: Path, place: int, name: str) -> None:
+def test_all_lights(shared_data, place, name):
     errors = mean_errors(
         shared_data / f"DiLiGenT/pmsData/{name}",
         [*ALL_LIGHTS],
@@ -233,7 +233,7 @@ def test_all_lights(shared_data: Path, place: int, name: str) -> None:
 
 
 @OBJECTS
-def test_ten_lights(shared_data: Path, place: int, name: str) -> None:
+def test_ten_lights(shared_data, place, name):
     folder = shared_data / f"DiLiGenT/pmsData/{name}"
     fits = [method for method in TEN_LIGHTS if method != "cnn-ps"]
     errors = mean_errors(folder, fits, Protocol(10, trials=10, max_pixels=500, as_stored=True))
@@ -327,7 +327,7 @@ def test_stored_prediction(name, request):
     estimated = make_estimator(name, MethodOptions(precision="float32")).estimate(
         observations, lights
     )
-    stored = json.loads(GOLDEN.read_text("utf-8"))
+    stored = read_json(GOLDEN)
     if request.config.getoption("--update-golden"):
         stored[name] = np.round(estimated, 4).tolist()
         GOLDEN.write_text(json.dumps(dict(sorted(stored.items()))) + "\n", "utf-8")

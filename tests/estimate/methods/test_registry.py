@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from scenes import spiral_lights
@@ -18,7 +19,7 @@ from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.lights.lighting import PixelLighting
-from splinecli.maths.normals import angle_between_deg
+from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.workshop.save_weights import save_weights
 from tiny_networks import TINY
 
@@ -37,7 +38,7 @@ def weights(tmp_path: Path) -> str:
     return save_tiny(tmp_path / "tiny.safetensors")
 
 
-def test_every_method_says_what_it_is_and_estimates(weights: str, tmp_path: Path) -> None:
+def test_every_method_says_what_it_is_and_estimates(weights, tmp_path):
     truth = np.array([[0.0, 0.0, 1.0], [0.28, 0.0, 0.96], [0.0, -0.28, 0.96]])
     observations = (truth @ LIGHTS.T * 0.5).astype(np.float32)
     alone = save_tiny(tmp_path / "alone.safetensors", interpolates=False)
@@ -54,12 +55,12 @@ def test_every_method_says_what_it_is_and_estimates(weights: str, tmp_path: Path
         # Lambertian fit.
         normals = estimator.estimate(observations, LIGHTS)
         assert normals.shape == (3, 3)
-        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-5)
-        np.testing.assert_allclose(normals, truth, atol=0.01)
+        assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-5)
+        assert_allclose(normals, truth, atol=0.01)
     assert len(fingerprints) == len(method_names())
 
 
-def test_what_decides_the_normals_is_in_the_fingerprint(weights: str) -> None:
+def test_what_decides_the_normals_is_in_the_fingerprint(weights):
     options = MethodOptions(weights=weights, device="cpu", precision="float32")
     others = (replace(options, rotations=3), replace(options, precision="bfloat16"))
     fingerprints = {make_estimator("spline-net", o).fingerprint for o in (options, *others)}
@@ -68,7 +69,7 @@ def test_what_decides_the_normals_is_in_the_fingerprint(weights: str) -> None:
     assert same.fingerprint in fingerprints
 
 
-def test_weights_of_the_other_network(weights: str, tmp_path: Path) -> None:
+def test_weights_of_the_other_network(weights, tmp_path):
     alone = save_tiny(tmp_path / "alone.safetensors", interpolates=False)
     for method, file, message in (
         (
@@ -87,12 +88,9 @@ def test_weights_of_the_other_network(weights: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("options", [MethodOptions(rotations=0), MethodOptions(batch_size=0)])
-def test_counts_from_one(options: MethodOptions, weights: str) -> None:
+def test_counts_from_one(options, weights):
     with pytest.raises(UsageError, match="whole numbers from 1"):
         make_estimator("spline-net", replace(options, weights=weights))
-
-
-Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
 SEE_CAPTURE = ("spline-net", "spline-net-pixelwise")
@@ -111,7 +109,7 @@ def largest_difference_deg(a: NDArray[np.floating], b: NDArray[np.floating]) -> 
 
 @pytest.mark.parametrize("name", method_names())
 @pytest.mark.parametrize("change", ["order of lights", "darker", "brighter", "batches", "turn"])
-def test_what_changes_nothing(name: str, change: str, glossy_pixels: Pixels) -> None:
+def test_what_changes_nothing(name, change, glossy_pixels):
     """But for CNN-PS, normals turn with the lights. That is only symmetric as far as its ten
     rotations go.
     """
@@ -133,7 +131,7 @@ def test_what_changes_nothing(name: str, change: str, glossy_pixels: Pixels) -> 
 
 @pytest.mark.parametrize("name", method_names())
 @pytest.mark.parametrize("n_lights", [3, 4, 14])
-def test_odd_pixels_still_get_a_normal(name: str, n_lights: int, glossy_pixels: Pixels) -> None:
+def test_odd_pixels_still_get_a_normal(name, n_lights, glossy_pixels):
     _, lights, observations = glossy_pixels
     odd = observations[:6, :n_lights].astype(np.float32)
     odd[0] = 0
@@ -142,12 +140,12 @@ def test_odd_pixels_still_get_a_normal(name: str, n_lights: int, glossy_pixels: 
     odd[3] = np.where(np.arange(n_lights) < 2, odd[3] + 1, 0)
     odd[4] *= -1  # a dark frame may have been subtracted
     found = make(name).estimate(odd, lights[:n_lights])
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
+    assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
     np.testing.assert_array_equal(found[0], (0, 0, 1))
 
 
 @pytest.mark.parametrize("name", method_names())
-def test_a_pixel_may_have_lights_of_its_own(name: str, glossy_pixels: Pixels) -> None:
+def test_a_pixel_may_have_lights_of_its_own(name, glossy_pixels):
     """Two pixels at a time, with shared lights, are the oracle for all pixels at once, with lights
     of their own.
 
@@ -174,11 +172,9 @@ def _about_view_axis(angle: float) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("count", [3, 4, 10, 96])
-def test_solves_the_normal_equations(count: int) -> None:
+def test_solves_the_normal_equations(count):
     observations = np.random.default_rng(0).uniform(size=(50, count))
     directions = spiral_lights(count)
     estimate = LeastSquares().estimate(observations, directions)
     expected = np.linalg.lstsq(directions, observations.T, rcond=None)[0].T
-    np.testing.assert_allclose(
-        estimate, expected / np.linalg.norm(expected, axis=1, keepdims=True), atol=1e-12
-    )
+    assert_allclose(estimate, unit(expected), atol=1e-12)

@@ -15,7 +15,9 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.testing import assert_close
 
+from distributions import seeded
 from splinecli.errors import ModelError
 from splinecli.estimate.networks.li_ne_net import PaperLINet, PaperNENet
 from splinecli.estimate.networks.spline_net import SplineNet
@@ -111,7 +113,7 @@ def authors() -> Authors:
                 tensor.is_floating_point() and tensor.ndim == 1
             ):  # scales, offsets, tracked statistics
                 tensor.uniform_(0.5, 2.0) if "var" in name or "weight" in name else tensor.normal_()
-        li_net.main[-2].weight.data *= 5  # so that the sigmoid's answers differ
+        li_net.main[-2].weight.data *= 5  # type: ignore[operator, assignment]  # so that the answers differ
     return li_net.requires_grad_(False), ne_net.eval().requires_grad_(False)
 
 
@@ -146,23 +148,21 @@ def changed(authors: Authors, files: Files, tmp_path: Path) -> Callable[..., Fil
 
 
 def maps(seed: int, channels: int = 1) -> Tensor:
-    return torch.rand(3, channels, SIDE, SIDE, generator=torch.Generator().manual_seed(seed))
+    return torch.rand(3, channels, SIDE, SIDE, generator=seeded(seed))
 
 
 def embed(observations: Tensor, lights: Tensor) -> Tensor:
     """Their observation maps (P, 1, 32, 32): q * 32 + p, with p from x and q from y, floor((n + 1)
     31 / 2).
     """
-    p, q = np.int32(0.5 * (lights.numpy()[:, :2] + 1) * (SIDE - 1)).T
+    p, q = (0.5 * (lights.numpy()[:, :2] + 1) * (SIDE - 1)).astype(np.int32).T
     filled = np.zeros((len(observations), SIDE * SIDE), np.float32)
     filled[:, q * SIDE + p] = (observations / observations.amax(1, keepdim=True)).numpy()
     return torch.as_tensor(filled).view(-1, 1, SIDE, SIDE)
 
 
-def test_observations_give_the_normals_that_theirs_give(
-    authors: Authors, imported: SplineNet
-) -> None:
-    generator = torch.Generator().manual_seed(4)
+def test_observations_give_the_normals_that_theirs_give(authors, imported):
+    generator = seeded(4)
     observations = torch.rand(6, 10, generator=generator) * 3
     lights = torch.randn(10, 3, generator=generator).abs() * torch.tensor((1.0, 1.0, 1.5))
     lights[::2, 0] *= -1
@@ -174,8 +174,8 @@ def test_observations_give_the_normals_that_theirs_give(
     with torch.no_grad():
         normals = imported(observations, lights).normals
         views = imported.build_maps(observations, lights)
-    torch.testing.assert_close(views.sparse.flip(2), sparse, atol=1e-7, rtol=0)
-    torch.testing.assert_close(normals, expected, atol=1e-5, rtol=0)
+    assert_close(views.sparse.flip(2), sparse, atol=1e-7, rtol=0)
+    assert_close(normals, expected, atol=1e-5, rtol=0)
     assert expected.std(0).max() > 1e-3
 
 
@@ -283,9 +283,9 @@ def test_checkpoints_that_expand_are_refused_unread(write, files, tmp_path, monk
     assert type(error.value.__cause__) is ValueError
 
 
-def test_files_that_are_no_checkpoints(files: Files, tmp_path: Path) -> None:
+def test_files_that_are_no_checkpoints(files, tmp_path):
     class Bomb:
-        def __reduce__(self) -> tuple[object, tuple[Path]]:
+        def __reduce__(self):
             return Path.touch, (tmp_path / "exploded",)
 
     path = tmp_path / "odd.ckpt"
@@ -331,9 +331,7 @@ def test_files_that_are_no_checkpoints(files: Files, tmp_path: Path) -> None:
     ("network", "theirs", "published"),
     [(PaperLINet(), AuthorsLINet(), 8.40), (PaperNENet(2, 32), AuthorsNENet(), 2.65)],
 )
-def test_the_published_number_of_parameters(
-    network: nn.Module, theirs: nn.Module, published: float
-) -> None:
+def test_the_published_number_of_parameters(network, theirs, published):
     count, expected = (
         sum(parameter.numel() for parameter in one.parameters()) for one in (network, theirs)
     )

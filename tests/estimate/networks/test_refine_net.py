@@ -5,8 +5,10 @@ others.
 import pytest
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
+from torch.testing import assert_close
 
-from distributions import generator as seeded
+from distributions import seeded
 from splinecli.estimate.fits.least_squares import alternating_signs
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.refine_net import (
@@ -32,7 +34,7 @@ HEIGHT, WIDTH = 6, 9
 
 def random_net(*, twice: bool = False) -> RefineNet:
     """A net whose every layer does something."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     net = RefineNet(twice=twice)
     with torch.no_grad():
         for parameter in net.parameters():
@@ -41,7 +43,7 @@ def random_net(*, twice: bool = False) -> RefineNet:
 
 
 def random_maps(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     mask = (torch.rand(1, 1, height, width, generator=generator) < 0.9).float()
     features = torch.randn(1, FEATURE_CHANNELS, height, width, generator=generator) * mask
     return features, mask
@@ -58,28 +60,28 @@ def features_of(observations: Tensor, lights: Tensor, normals: Tensor, error: Te
 
 @pytest.mark.parametrize("mirror", [False, True])
 @pytest.mark.parametrize("quarters", range(4))
-def test_features_turn_with_the_image(quarters: int, mirror: bool) -> None:
-    generator = torch.Generator().manual_seed(1)
-    lights = torch.nn.functional.normalize(
+def test_features_turn_with_the_image(quarters, mirror):
+    generator = seeded(1)
+    lights = normalize(
         torch.randn(8, 3, generator=generator) + torch.tensor((0.0, 0.0, 2.0)), dim=1
     )
     normals = (
         torch.randn(3, HEIGHT, WIDTH, generator=generator)
         + torch.tensor((0.0, 0.0, 2.0))[:, None, None]
     )
-    normals = torch.nn.functional.normalize(normals, dim=0)
+    normals = normalize(normals, dim=0)
     error = torch.randn(2, HEIGHT, WIDTH, generator=generator)
     shading = torch.einsum("fc,chw->fhw", lights, normals).clamp(min=0)
     observations = shading**1.5 + 0.05 * torch.rand(8, HEIGHT, WIDTH, generator=generator)
 
-    def turned(vectors: Tensor) -> Tensor:
+    def turned(vectors):
         """Vectors (3, ...), turned."""
         x, y, z = (-vectors[0] if mirror else vectors[0]), vectors[1], vectors[2]
         for _ in range(quarters):
             x, y = -y, x
         return torch.stack((x, y, z))
 
-    def moved(maps: Tensor) -> Tensor:
+    def moved(maps):
         return (maps.flip(-1) if mirror else maps).rot90(quarters, (-2, -1))
 
     expected = features_of(
@@ -89,23 +91,23 @@ def test_features_turn_with_the_image(quarters: int, mirror: bool) -> None:
     features = features_of(observations, lights, normals, error)
     found = turn_features(features, turn)
     found_normals = turn_maps(normals, turn, vectors=((0, 1),))
-    torch.testing.assert_close(found, expected, atol=2e-4, rtol=1e-4)
-    torch.testing.assert_close(found_normals, turned(moved(normals)))
-    torch.testing.assert_close(turn_features(found, turn.back), features)
-    torch.testing.assert_close(turn_maps(found_normals, turn.back, vectors=((0, 1),)), normals)
+    assert_close(found, expected, atol=2e-4, rtol=1e-4)
+    assert_close(found_normals, turned(moved(normals)))
+    assert_close(turn_features(found, turn.back), features)
+    assert_close(turn_maps(found_normals, turn.back, vectors=((0, 1),)), normals)
 
 
 @pytest.mark.parametrize("twice", [False, True])
-def test_a_new_net_changes_nothing(twice: bool) -> None:
+def test_a_new_net_changes_nothing(twice):
     features, mask = random_maps(12, 15)
-    features[:, :3] = torch.nn.functional.normalize(features[:, :3], dim=1)
+    features[:, :3] = normalize(features[:, :3], dim=1)
     normals, error = RefineNet(twice=twice)(features, mask)
     before, error_before = split_features(features)
-    torch.testing.assert_close(normals, before * mask)
-    torch.testing.assert_close(error, error_before * mask)
+    assert_close(normals, before * mask)
+    assert_close(error, error_before * mask)
 
 
-def test_a_second_net_reads_the_results_of_the_first() -> None:
+def test_a_second_net_reads_the_results_of_the_first():
     features, mask = random_maps(12, 16)
     both = random_net(twice=True)
     assert both.again is not None
@@ -115,20 +117,20 @@ def test_a_second_net_reads_the_results_of_the_first() -> None:
     )
     normals, error = first(features, mask)
     changed = with_refined(features, normals, error)
-    torch.testing.assert_close(split_features(changed), (normals, error))
+    assert_close(split_features(changed), (normals, error))
     for fit in ("robust", "plain"):  # the fits themselves stay
-        torch.testing.assert_close(
+        assert_close(
             changed[:, channels(fit)] + normals,
             features[:, channels(fit)] + features[:, channels("normal")],
         )
     found = both(features, mask, (slice(0, 8), slice(8, 16)))
     for part, whole in zip(found, both.again(changed * mask, mask), strict=True):
-        torch.testing.assert_close(part, whole[..., :8, 8:], atol=1e-4, rtol=1e-4)
+        assert_close(part, whole[..., :8, 8:], atol=1e-4, rtol=1e-4)
     assert (found[0] - normals[..., :8, 8:]).abs().max() > 1e-3
 
 
 @pytest.mark.parametrize("twice", [False, True])
-def test_outside_of_the_mask_is_outside_of_the_image(twice: bool) -> None:
+def test_outside_of_the_mask_is_outside_of_the_image(twice):
     features, mask = random_maps(20, 24)
     wide = torch.nn.functional.pad(features, (COARSEST, 9, 2 * COARSEST, 3))
     wide_mask = torch.nn.functional.pad(mask, (COARSEST, 9, 2 * COARSEST, 3))
@@ -136,12 +138,12 @@ def test_outside_of_the_mask_is_outside_of_the_image(twice: bool) -> None:
     box = (..., slice(2 * COARSEST, 2 * COARSEST + 20), slice(COARSEST, COARSEST + 24))
     found = net(features.double(), mask.double()), net(wide.double(), wide_mask.double())
     for alone, within in zip(*found, strict=True):
-        torch.testing.assert_close(within[box], alone, atol=1e-5, rtol=1e-5)
+        assert_close(within[box], alone, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("twice", [False, True])
 @pytest.mark.parametrize("turned", [False, True])
-def test_nothing_beyond_the_reach_counts(turned: bool, twice: bool) -> None:
+def test_nothing_beyond_the_reach_counts(turned, twice):
     """Along a strip that is as wide as two of the coarsest cells."""
     net = random_net(twice=twice).double()
     size = 2 * net.reach + COARSEST
@@ -163,7 +165,7 @@ SEES = TINY | {"map_size": 16, "set_width": 16, "set_layers": 2, "error_head": T
 
 def pixels(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     """Random observations under seven lights."""
-    lights = torch.nn.functional.normalize(torch.rand(7, 3, generator=seeded(seed)) + 0.2, dim=1)
+    lights = normalize(torch.rand(7, 3, generator=seeded(seed)) + 0.2, dim=1)
     return torch.rand(count, 7, generator=seeded(seed + 1)), lights
 
 
@@ -172,7 +174,7 @@ def network() -> SplineNet:
     return random_network(**SEES, sees_capture=True)
 
 
-def test_at_first_a_capture_says_nothing() -> None:
+def test_at_first_a_capture_says_nothing():
     alone, seeing = (
         SplineNet(NetworkConfig(**SEES, sees_capture=sees)).eval() for sees in (False, True)
     )
@@ -187,26 +189,22 @@ def test_at_first_a_capture_says_nothing() -> None:
         assert torch.equal(found, expected)
 
 
-def test_a_sample_of_all_pixels_is_the_capture_itself(network: SplineNet) -> None:
+def test_a_sample_of_all_pixels_is_the_capture_itself(network):
     observations, lights = pixels(20)
     context = network.encode_context(observations, lights)
     whole = network(observations, lights)
     parts = [network(part, lights, context=context) for part in observations.split(7)]
-    torch.testing.assert_close(
-        torch.cat([part.normals for part in parts]), whole.normals, atol=3e-5, rtol=0
-    )
-    torch.testing.assert_close(
-        torch.cat([part.error for part in parts]), whole.error, atol=1e-4, rtol=0
-    )
+    assert_close(torch.cat([part.normals for part in parts]), whole.normals, atol=3e-5, rtol=0)
+    assert_close(torch.cat([part.error for part in parts]), whole.error, atol=1e-4, rtol=0)
     # It does say something, and the order of the sample does not matter.
     other = network(observations, lights, context=network.encode_context(*pixels(20, 5)))
     assert (other.normals - whole.normals).abs().max() > 1e-3
     shuffled = network.encode_context(observations.flip(0), lights)
     again = network(observations, lights, context=shuffled)
-    torch.testing.assert_close(again.normals, whole.normals, atol=3e-5, rtol=0)
+    assert_close(again.normals, whole.normals, atol=3e-5, rtol=0)
 
 
-def test_captures_of_a_batch_do_not_see_each_other(network: SplineNet) -> None:
+def test_captures_of_a_batch_do_not_see_each_other(network):
     captures = [pixels(9, seed) for seed in (0, 10, 20)]
     # Pixel p belongs to capture p % 3.
     observations = torch.stack([seen for seen, _ in captures], dim=1).flatten(0, 1)
@@ -218,20 +216,18 @@ def test_captures_of_a_batch_do_not_see_each_other(network: SplineNet) -> None:
         alone = network.estimate(maps, network.interpolate(maps))
         # Processors with AMX round sums of other sizes of batches differently; another capture
         # would change 0.01.
-        torch.testing.assert_close(together.normals[number::3], alone.normals, atol=3e-4, rtol=0)
+        assert_close(together.normals[number::3], alone.normals, atol=3e-4, rtol=0)
 
 
-def test_the_exposure_of_a_capture_does_not_matter_but_the_brightness_of_a_pixel_does(
-    network: SplineNet,
-) -> None:
+def test_the_exposure_of_a_capture_does_not_matter_but_the_brightness_of_a_pixel_does(network):
     observations, lights = pixels(16)
     whole = network(observations, lights).normals
-    torch.testing.assert_close(network(37 * observations, lights).normals, whole, atol=1e-5, rtol=0)
+    assert_close(network(37 * observations, lights).normals, whole, atol=1e-5, rtol=0)
     darker = observations * torch.linspace(0.1, 1, 16)[:, None]
     assert (network(darker, lights).normals - whole).abs().max() > 1e-3
 
 
-def test_attention_and_mean_are_those_of_the_formulas() -> None:
+def test_attention_and_mean_are_those_of_the_formulas():
     """One capture, computed once more pixel by pixel and head by head in float64."""
     torch.manual_seed(0)
     layer = ContextLayer(16).double()
@@ -249,6 +245,4 @@ def test_attention_and_mean_are_those_of_the_formulas() -> None:
             weights = torch.softmax(keys[:, part] @ asked / 2, dim=0)
             heads.append(weights @ values[:, part])
         seen = torch.cat((queries[pixel], *heads, layer.pooled(sample).mean(dim=0)))
-        torch.testing.assert_close(
-            found[pixel], tokens[pixel] + layer.join(seen), atol=1e-5, rtol=1e-5
-        )
+        assert_close(found[pixel], tokens[pixel] + layer.join(seen), atol=1e-5, rtol=1e-5)

@@ -9,7 +9,10 @@ import pytest
 import torch
 from scipy import stats
 from torch import Tensor, nn
+from torch.nn.functional import normalize
+from torch.testing import assert_close
 
+from distributions import seeded
 from splinecli.estimate.fits.least_squares import fit_lambertian
 from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.estimate.networks.config import STARTING_FITS, NetworkConfig, fit_normals
@@ -30,10 +33,10 @@ def pixels() -> tuple[Tensor, Tensor]:
     another cell.
     """
     config = PixelGeneratorConfig(min_lights=10, max_lights=10, light_direction_error_share=0.0)
-    generator = torch.Generator().manual_seed(5)
+    generator = seeded(5)
     lights = PixelGenerator(config, generator).draw(1).light_directions[0].double()
     scene = PixelGenerator(config, generator).draw(64).truth
-    return scene.radiance(lights.float()).double(), torch.nn.functional.normalize(lights, dim=1)
+    return scene.radiance(lights.float()).double(), normalize(lights, dim=1)  # type: ignore[attr-defined]
 
 
 def turn(vectors: Tensor, degrees: float) -> Tensor:
@@ -41,28 +44,22 @@ def turn(vectors: Tensor, degrees: float) -> Tensor:
     return rotate_about_view_axis(vectors.double(), angle.cos(), angle.sin())
 
 
-def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(
-    pixels: tuple[Tensor, Tensor],
-) -> None:
+def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(pixels):
     observations, lights = pixels
     network = SplineNet(NetworkConfig(**TINY)).double()
-    expected = torch.nn.functional.normalize(
-        fit_lambertian(observations / map_scale(observations), lights), dim=1
-    )
+    expected = normalize(fit_lambertian(observations / map_scale(observations), lights), dim=1)
     visible = expected[:, 2] > 0.05
     assert visible.sum() > 50
     with torch.no_grad():
         normals = network(observations, lights).normals
         dense = network.interpolate(network.build_maps(observations, lights))
-    torch.testing.assert_close(
-        normals[visible], expected[visible], atol=1e-6, rtol=0, check_dtype=False
-    )
+    assert_close(normals[visible], expected[visible], atol=1e-6, rtol=0, check_dtype=False)
     # Its dense map is that normal's Lambertian one, turned to azimuth 0.
     b = fit_lambertian(observations / map_scale(observations), lights)[visible]
     x, z = b[:, :2].norm(dim=1)[:, None, None], b[:, 2, None, None]
     cells, _ = cell_directions()
     matte = (x * cells[..., 0] + z * cells[..., 2]).clamp(0, 1)
-    torch.testing.assert_close(dense[visible, 0], matte, atol=1e-6, rtol=0)
+    assert_close(dense[visible, 0], matte, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("settings", [{}, SET])
@@ -74,10 +71,10 @@ def test_compact_estimates_turn_with_the_lights(pixels, degrees, settings):
         here, there = (
             network(observations, seen).normals for seen in (lights, turn(lights, degrees))
         )
-    torch.testing.assert_close(there.double(), turn(here, degrees), atol=1e-5, rtol=0)
+    assert_close(there.double(), turn(here, degrees), atol=1e-5, rtol=0)
     # The correction is not nothing: without it the fit alone would pass.
     fit = fit_lambertian(observations / map_scale(observations), lights)
-    assert (here - torch.nn.functional.normalize(fit, dim=1)).abs().max() > 0.01
+    assert (here - normalize(fit, dim=1)).abs().max() > 0.01
 
 
 @pytest.mark.parametrize("settings", [{}, SET])
@@ -88,12 +85,10 @@ def test_observations_that_are_not_valid_do_not_matter(pixels, settings):
     garbage = observations.where(valid, torch.tensor(9.0, dtype=torch.float64))
     with torch.no_grad():
         expected = network(observations[:, :7], lights[:7]).normals
-        torch.testing.assert_close(
-            network(garbage, lights, valid).normals, expected, atol=1e-5, rtol=0
-        )
+        assert_close(network(garbage, lights, valid).normals, expected, atol=1e-5, rtol=0)
 
 
-def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(pixels: tuple[Tensor, Tensor]) -> None:
+def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(pixels):
     # Turned by t and then mirrored is mirrored and then turned by -t.
     observations, lights = pixels
     network = random_network().double()
@@ -101,29 +96,29 @@ def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(pixels: tuple[Tensor
         mirrored = network(observations, lights, rotation=Rotation(7.0, mirror=True)).normals
         expected = network(observations, lights * FLIP, rotation=Rotation(-7.0)).normals * FLIP
         plain = network(observations, lights, rotation=Rotation(7.0)).normals
-    torch.testing.assert_close(mirrored, expected, atol=1e-5, rtol=0, check_dtype=False)
+    assert_close(mirrored, expected, atol=1e-5, rtol=0, check_dtype=False)
     assert (mirrored - plain).abs().max() > 1e-4
 
 
 @pytest.mark.parametrize("mirror", [False, True])
-def test_frames_there_and_back(pixels: tuple[Tensor, Tensor], mirror: bool) -> None:
+def test_frames_there_and_back(pixels, mirror):
     observations, lights = pixels
     network = random_network().double()
     views = network.build_maps(
         observations, lights, rotation=Rotation(torch.linspace(-15, 15, 64), mirror=mirror)
     )
-    vectors = torch.nn.functional.normalize(torch.randn(64, 3, dtype=torch.float64), dim=1)
-    torch.testing.assert_close(to_capture_frame(to_pixel_frame(vectors, views), views), vectors)
+    vectors = normalize(torch.randn(64, 3, dtype=torch.float64), dim=1)
+    assert_close(to_capture_frame(to_pixel_frame(vectors, views), views), vectors)
     # In its own frame a pixel's Lambertian normal has the azimuth of the further turn, mirrored or
     # not.
     fit = fit_lambertian(observations / map_scale(observations), lights)
     tilted = fit[:, :2].norm(dim=1) > 0.01
     azimuth = torch.rad2deg(torch.atan2(*to_pixel_frame(fit, views)[:, [1, 0]].unbind(1)))
     expected = torch.linspace(-15, 15, 64) * (-1 if mirror else 1)
-    torch.testing.assert_close(azimuth[tilted], expected[tilted].double(), atol=1e-4, rtol=0)
+    assert_close(azimuth[tilted], expected[tilted].double(), atol=1e-4, rtol=0)
 
 
-def test_autocast_does_not_round_the_geometry(pixels: tuple[Tensor, Tensor]) -> None:
+def test_autocast_does_not_round_the_geometry(pixels):
     observations, lights = pixels[0].float(), pixels[1].float()
     network = random_network()
     for parameter in network.ne_net.out.parameters():
@@ -131,11 +126,11 @@ def test_autocast_does_not_round_the_geometry(pixels: tuple[Tensor, Tensor]) -> 
     with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
         coarse = network(observations, lights).normals
     with torch.no_grad():
-        torch.testing.assert_close(coarse, network(observations, lights).normals, atol=1e-6, rtol=0)
+        assert_close(coarse, network(observations, lights).normals, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize(("median_deg", "shape"), [(0.5, 1.0), (4.0, 2.5), (30.0, 0.7)])
-def test_a_log_logistic_distribution(median_deg: float, shape: float) -> None:
+def test_a_log_logistic_distribution(median_deg, shape):
     error = torch.tensor(
         [[math.log(math.radians(median_deg)), math.log(shape)]], dtype=torch.float64
     )
@@ -151,11 +146,11 @@ def test_a_log_logistic_distribution(median_deg: float, shape: float) -> None:
     np.testing.assert_allclose(found, -logistic.logpdf(np.log(angles_deg + 0.1)))
 
 
-def test_it_changes_no_normal() -> None:
+def test_it_changes_no_normal():
     plain, telling = random_network(fits=["ls"]), random_network(fits=["ls"], error_head=True)
     telling.load_state_dict(plain.state_dict(), strict=False)
-    generator = torch.Generator().manual_seed(1)
-    lights = torch.nn.functional.normalize(torch.rand(9, 3, generator=generator) + 0.1, dim=1)
+    generator = seeded(1)
+    lights = normalize(torch.rand(9, 3, generator=generator) + 0.1, dim=1)
     observations = torch.rand(20, 9, generator=generator)
     with torch.inference_mode():
         normals, error = telling(observations, lights)
@@ -165,11 +160,11 @@ def test_it_changes_no_normal() -> None:
         # It is of the pixel, not of its place in the capture's frame.
         turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         turned = telling(observations, lights @ turn.T).error
-    torch.testing.assert_close(turned, error, atol=1e-4, rtol=0)
+    assert_close(turned, error, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("n_maps", [1, 300])
-def test_few_products_give_the_features_of_the_convolutions(n_maps: int) -> None:
+def test_few_products_give_the_features_of_the_convolutions(n_maps):
     encoder = MapEncoder(3, 24, 2, 16)
     for parameter in encoder.parameters():
         nn.init.normal_(parameter, std=0.1)
@@ -177,7 +172,7 @@ def test_few_products_give_the_features_of_the_convolutions(n_maps: int) -> None
     with torch.no_grad():
         found = encoder(maps)
         expected = encoder.double()(maps.double())
-    torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-4)
+    assert_close(found.double(), expected, rtol=1e-4, atol=1e-4)
 
 
 NAMES = tuple(STARTING_FITS)
@@ -187,26 +182,26 @@ def draw_pixels(count: int, lights: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Observations (P, F), the largest of each pixel 1, and lights (P, F, 3) of its own for each
     pixel.
     """
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     directions = torch.randn(count, lights, 3, generator=generator) + torch.tensor((0.0, 0.0, 2.0))
-    directions = torch.nn.functional.normalize(directions, dim=-1)
+    directions = normalize(directions, dim=-1)
     observations = torch.rand(count, lights, generator=generator)
     return observations / observations.amax(dim=1, keepdim=True), directions
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "iw12-all"])
-def test_they_are_the_methods_of_these_names(name: str) -> None:
+def test_they_are_the_methods_of_these_names(name):
     observations, directions = draw_pixels(20, 12)
     shared = directions[0]
     expected = make_estimator(name, MethodOptions(device="cpu")).estimate(
         observations.numpy(), shared.double().numpy()
     )
     found = fit_normals([name], observations, shared)[:, 0]
-    torch.testing.assert_close(found, torch.from_numpy(expected).float(), atol=1e-5, rtol=0)
+    assert_close(found, torch.from_numpy(expected).float(), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_pixel_has_its_own_lights_and_their_number(name: str) -> None:
+def test_each_pixel_has_its_own_lights_and_their_number(name):
     observations, directions = draw_pixels(9, 12)
     count = torch.tensor([12, 11, 10, 9, 8, 7, 6, 5, 4])
     valid = torch.arange(12) < count[:, None]
@@ -214,10 +209,10 @@ def test_each_pixel_has_its_own_lights_and_their_number(name: str) -> None:
     for pixel in range(9):
         own = slice(0, int(count[pixel]))
         alone = fit_normals([name], observations[pixel : pixel + 1, own], directions[pixel, own])
-        torch.testing.assert_close(found[pixel : pixel + 1], alone, atol=1e-4, rtol=0)
+        assert_close(found[pixel : pixel + 1], alone, atol=1e-4, rtol=0)
 
 
-def test_pixels_that_no_fit_can_tell_anything_of() -> None:
+def test_pixels_that_no_fit_can_tell_anything_of():
     directions = draw_pixels(1, 6)[1][0]
     observations = torch.tensor([[0.0] * 6, [1.0] + [0.0] * 5, [-0.2] * 5 + [1.0]])
     found = fit_normals(NAMES, observations, directions)

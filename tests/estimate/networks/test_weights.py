@@ -11,6 +11,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
+from torch.testing import assert_close
 
 from splinecli.errors import ModelError
 from splinecli.estimate.networks import weights
@@ -36,7 +37,7 @@ def write_like_splinecli(
 
 
 @pytest.mark.parametrize("settings", [{}, {"size": "paper", "map_size": 8}])
-def test_round_trip(tmp_path: Path, settings: dict[str, object]) -> None:
+def test_round_trip(tmp_path, settings):
     network = random_network(**settings)
     path = tmp_path / "tiny.safetensors"
     save_weights(network, path)
@@ -47,15 +48,13 @@ def test_round_trip(tmp_path: Path, settings: dict[str, object]) -> None:
     assert loaded.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     for name, tensor in network.state_dict().items():
         # float16 keeps 11 bits.
-        torch.testing.assert_close(
-            loaded.network.state_dict()[name], tensor, rtol=2**-11, atol=2**-24
-        )
+        assert_close(loaded.network.state_dict()[name], tensor, rtol=2**-11, atol=2**-24)
     lights = torch.nn.functional.normalize(
         torch.tensor([[0.3, 0, 1], [-0.3, 0.2, 1], [0, -0.4, 1]]), dim=1
     )
     observations = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        torch.testing.assert_close(
+        assert_close(
             loaded.network(observations, lights).normals,
             network(observations, lights).normals,
             atol=5e-3,
@@ -63,7 +62,7 @@ def test_round_trip(tmp_path: Path, settings: dict[str, object]) -> None:
         )
 
 
-def test_every_tensor_and_no_other(tmp_path: Path) -> None:
+def test_every_tensor_and_no_other(tmp_path):
     network, path = random_network(), tmp_path / "odd.safetensors"
     tensors = {name: tensor.half().contiguous() for name, tensor in network.state_dict().items()}
     write_like_splinecli(path, network, tensors)
@@ -77,7 +76,7 @@ def test_every_tensor_and_no_other(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("config", ["", "{", "3", '["width"]', '{"width": -1}', '{"height": 3}'])
-def test_a_configuration_that_cannot_be(tmp_path: Path, config: str) -> None:
+def test_a_configuration_that_cannot_be(tmp_path, config):
     network = random_network()
     tensors = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
     write_like_splinecli(tmp_path / "odd.safetensors", network, tensors, config=config)
@@ -108,9 +107,7 @@ class TensorsMade(TorchFunctionMode):
         {"li_blocks": 65},
     ],
 )
-def test_a_configuration_far_larger_than_the_tensors(
-    tmp_path: Path, settings: dict[str, int]
-) -> None:
+def test_a_configuration_far_larger_than_the_tensors(tmp_path, settings):
     """It is refused without making its tensors, which would take gigabytes."""
     network, path = random_network(), tmp_path / "a.safetensors"
     config = json.dumps({**network.config.to_dict(), **settings})
@@ -123,7 +120,7 @@ def test_a_configuration_far_larger_than_the_tensors(
     assert max(tensors.made, default=0) < 1_000_000
 
 
-def test_no_changed_byte_goes_unnoticed(saved: Path) -> None:
+def test_no_changed_byte_goes_unnoticed(saved):
     whole = saved.read_bytes()
     for position in range(0, len(whole), 61):
         saved.write_bytes(whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :])
@@ -134,13 +131,13 @@ def test_no_changed_byte_goes_unnoticed(saved: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"not weights\n", b"\x00" * 64, None])
-def test_files_of_other_kinds(saved: Path, content: bytes | None) -> None:
+def test_files_of_other_kinds(saved, content):
     saved.write_bytes(saved.read_bytes()[:-100] if content is None else content)
     with pytest.raises(ModelError, match="not a safetensors file"):
         load_weights(saved)
 
 
-def test_somebody_else_s_safetensors(tmp_path: Path) -> None:
+def test_somebody_else_s_safetensors(tmp_path):
     path = tmp_path / "other.safetensors"
     # bfloat16, which numpy does not know: the format is read before any tensor.
     save_file({"weight": torch.zeros(3, dtype=torch.bfloat16)}, path)
@@ -148,9 +145,9 @@ def test_somebody_else_s_safetensors(tmp_path: Path) -> None:
         load_weights(path)
 
 
-def test_nothing_is_unpickled(tmp_path: Path) -> None:
+def test_nothing_is_unpickled(tmp_path):
     class Bomb:
-        def __reduce__(self) -> tuple[object, tuple[Path]]:
+        def __reduce__(self):
             return Path.touch, (tmp_path / "exploded",)
 
     path = tmp_path / "weights.pth"
@@ -166,7 +163,7 @@ def test_nothing_is_unpickled(tmp_path: Path) -> None:
         resolve_weights(str(tmp_path))
 
 
-def test_shipped_weights_by_name(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shipped_weights_by_name(saved, monkeypatch):
     monkeypatch.setattr(weights, "SHIPPED", saved.parent)
     entry = {"file": saved.name, "sha256": hashlib.sha256(saved.read_bytes()).hexdigest()}
     (saved.parent / "weights.json").write_text(
@@ -180,16 +177,16 @@ def test_shipped_weights_by_name(saved: Path, monkeypatch: pytest.MonkeyPatch) -
         resolve_weights("better")
 
 
-def test_weights_that_are_not_finite(tmp_path: Path) -> None:
+def test_weights_that_are_not_finite(tmp_path):
     network = SplineNet(NetworkConfig(**TINY))
     with torch.no_grad():
-        network.ne_net.out.bias[0] = float("nan")  # type: ignore[union-attr, operator, index]
+        network.ne_net.out.bias[0] = float("nan")  # type: ignore[operator]
     save_weights(network, tmp_path / "nan.safetensors")
     with pytest.raises(ModelError, match="not finite"):
         load_weights(tmp_path / "nan.safetensors")
 
 
-def test_countless_empty_tensors_are_refused_unread(tmp_path: Path) -> None:
+def test_countless_empty_tensors_are_refused_unread(tmp_path):
     empty = {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]}
     header = json.dumps({str(number): empty for number in range(30_000)}).encode()
     (tmp_path / "a.safetensors").write_bytes(len(header).to_bytes(8, "little") + header)
@@ -199,7 +196,7 @@ def test_countless_empty_tensors_are_refused_unread(tmp_path: Path) -> None:
         load_weights(tmp_path / "a.safetensors")
 
 
-def test_round_trip_of_a_configuration() -> None:
+def test_round_trip_of_a_configuration():
     paper = NetworkConfig(size="paper", map_size=16, width=5, grid="cnn-ps", interpolates=False)
     for config in (paper, NetworkConfig(fits=("ia14", "ls"))):
         assert NetworkConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
@@ -228,6 +225,6 @@ def test_round_trip_of_a_configuration() -> None:
         ({"map_size": 4096}, "'map_size' is 4096"),
     ],
 )
-def test_refused(values: dict[str, Any], message: str) -> None:
+def test_refused(values, message):
     with pytest.raises(ModelError, match=message):
         NetworkConfig.from_dict(values)

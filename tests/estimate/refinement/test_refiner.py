@@ -8,11 +8,14 @@ from typing import TypeVar
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import normalize, pad
+from torch.testing import assert_close
 
 from conftest import directions_at
+from distributions import seeded
 from scenes import evaluate, spiral_lights
 from splinecli.capture import Capture
 from splinecli.estimate.fits.least_squares import alternating_signs
@@ -41,7 +44,7 @@ Network = TypeVar("Network", bound=torch.nn.Module)
 
 def lively(network: Network) -> Network:
     """Fill every parameter with small random numbers."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.copy_(0.08 * torch.randn(parameter.shape, generator=generator))
@@ -71,7 +74,7 @@ def refine(
 
 
 @pytest.mark.parametrize("shape", [(2 * REACH + 70, 40), (40, 2 * REACH + 70)])
-def test_tiles_change_nothing(shape: tuple[int, int]) -> None:
+def test_tiles_change_nothing(shape):
     """Three tiles in a row or in a column. Seams of tiles on all sides:
     test_shipped_refinement.py.
     """
@@ -79,33 +82,33 @@ def test_tiles_change_nothing(shape: tuple[int, int]) -> None:
     mask[30:60, 10:30] = False
     _, normals, errors = refine(mask, 512)
     _, tiled, tiled_errors = refine(mask, REACH)
-    np.testing.assert_allclose(tiled, normals, atol=1e-4)
-    np.testing.assert_allclose(tiled_errors, errors, rtol=1e-4, atol=1e-3)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    assert_allclose(tiled, normals, atol=1e-4)
+    assert_allclose(tiled_errors, errors, rtol=1e-4, atol=1e-3)
+    assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (37, 1), (5, 6)])
-def test_small_and_thin_masks(shape: tuple[int, int]) -> None:
+def test_small_and_thin_masks(shape):
     before, normals, _ = refine(np.ones(shape, np.bool_), 512)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
     assert np.abs(normals - before).max() > 1e-3
 
 
-def test_dark_pixels_stay() -> None:
+def test_dark_pixels_stay():
     before, normals, errors = refine(np.ones((8, 9), np.bool_), 512, dark=20)
-    np.testing.assert_array_equal(normals[20], before[20])
-    np.testing.assert_allclose(errors[20], UNKNOWN_ERROR, rtol=1e-6)
+    assert_array_equal(normals[20], before[20])
+    assert_allclose(errors[20], UNKNOWN_ERROR, rtol=1e-6)
     assert (normals[21] != before[21]).any()
 
 
-def test_a_turned_capture_gets_turned_normals() -> None:
+def test_a_turned_capture_gets_turned_normals():
     """The mean over four turns does not depend on how the camera was held."""
     rng = np.random.default_rng(3)
     mask = rng.random((24, 32)) < 0.9
     normals = unit(rng.normal((0, 0, 3), 1, (*mask.shape, 3))).astype(np.float32)
     net = lively(RefineNet())
 
-    def refined(turns: int) -> NDArray[np.float32]:
+    def refined(turns):
         """Refine the map turned counterclockwise by quarters, and turn the result back."""
         turn = np.round(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])) if turns else np.eye(3)
         seen, lights = np.rot90(mask, turns), LIGHTS @ turn.T
@@ -121,7 +124,7 @@ def test_a_turned_capture_gets_turned_normals() -> None:
 
     # The cells of the coarse scales begin at the map's corner, so both sides are multiples of them
     # in this test.
-    np.testing.assert_allclose(refined(1), refined(0), atol=1e-3)
+    assert_allclose(refined(1), refined(0), atol=1e-3)
 
 
 def estimator(*, refines: bool) -> NetworkEstimator:
@@ -132,7 +135,7 @@ def estimator(*, refines: bool) -> NetworkEstimator:
     )
 
 
-def test_the_pixelwise_method_leaves_the_refinement_out() -> None:
+def test_the_pixelwise_method_leaves_the_refinement_out():
     rng = np.random.default_rng(2)
     mask = np.ones((7, 8), np.bool_)
     capture = Capture(
@@ -142,13 +145,13 @@ def test_the_pixelwise_method_leaves_the_refinement_out() -> None:
         estimate_normals(capture, estimator(refines=refines)) for refines in (False, True)
     )
     alone = estimator(refines=True).estimate(capture.observations, LIGHTS)
-    np.testing.assert_array_equal(pixelwise.normal_map[mask], alone)
+    assert_array_equal(pixelwise.normal_map[mask], alone)
     assert np.abs(refined.normal_map - pixelwise.normal_map).max() > 1e-3
     assert np.abs(refined.confidence_map - pixelwise.confidence_map).max() > 1e-3
 
 
 @pytest.mark.parametrize("of_package", [False, True])
-def test_scored_pixels_are_estimated_among_all(of_package: bool) -> None:
+def test_scored_pixels_are_estimated_among_all(of_package):
     """Refinement and context need the whole capture: 50 pixels score as they do in the map of
     `infer`.
     """
@@ -181,7 +184,7 @@ def photographed(
     """Features (CHANNELS, SIDE, SIDE) of a matte surface, where SPLINE-Net has seen the normals
     `seen` (the truth).
     """
-    generator = torch.Generator().manual_seed(4)
+    generator = seeded(4)
     errors = noise * torch.randn(SIDE**2, len(lights), generator=generator)
     observations = (truth.flatten(1).T @ lights.T + errors).clamp(min=0)
     normals = (truth if seen is None else seen).flatten(1).T
@@ -209,9 +212,7 @@ def restored(refined: Tensor, features: Tensor, mask: Tensor) -> Tensor:
 @pytest.mark.parametrize(
     ("noise", "least", "most"), [(0.005, 0.975, 0.985), (0.03, 0.9, 0.985), (0.4, -0.001, 0.01)]
 )
-def test_grooves_come_back_where_they_exceed_the_noise(
-    noise: float, least: float, most: float
-) -> None:
+def test_grooves_come_back_where_they_exceed_the_noise(noise, least, most):
     """All of x comes back. Its share of the unit vector is smaller by the cosine, because z is no
     detail.
     """
@@ -221,15 +222,15 @@ def test_grooves_come_back_where_they_exceed_the_noise(
     assert least < float((found[0] / GROOVES[0])[:, middle].mean()) < most
 
 
-def test_nothing_comes_back_that_least_squares_does_not_show() -> None:
+def test_nothing_comes_back_that_least_squares_does_not_show():
     """SPLINE-Net has seen the opposite of the grooves."""
     features = photographed(GROOVES, 0.005, seen=torch.roll(GROOVES, 1, dims=-1))
-    torch.testing.assert_close(restored(FLAT, features, EVERYWHERE), FLAT, atol=1e-4, rtol=0)
+    assert_close(restored(FLAT, features, EVERYWHERE), FLAT, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("creased", [False, True])
 @pytest.mark.parametrize("lights", [FEW_LIGHTS, FEW_LIGHTS[:6], SQUARE])
-def test_noise_stays_removed(lights: Tensor, creased: bool) -> None:
+def test_noise_stays_removed(lights, creased):
     """Also beside a crease, which is detail that is not missing."""
     slope = torch.where(torch.arange(SIDE) < SIDE // 2, 0.4, -0.4).expand(SIDE, SIDE)
     crease = normalize(
@@ -241,27 +242,27 @@ def test_noise_stays_removed(lights: Tensor, creased: bool) -> None:
     assert (found - truth).square().mean() < 0.01 * (noisy[:3] - truth).square().mean()
 
 
-def test_black_pixels_change_nothing_beside_them() -> None:
+def test_black_pixels_change_nothing_beside_them():
     """Their zero vectors are no detail."""
     black = torch.arange(SIDE) < SIDE // 2
     truth = torch.where(black, 0.0, FLAT)
     noisy = photographed_with_noise(truth, 0.03)
     noisy[:, :, black] = 0
     found = restored(FLAT, noisy, EVERYWHERE)
-    torch.testing.assert_close(found[..., black], FLAT[..., black])
+    assert_close(found[..., black], FLAT[..., black])
     assert (found - FLAT).square().mean() < 0.01 * (noisy[:3] - truth).square().mean()
 
 
-def test_outside_of_the_mask_is_outside_of_the_image() -> None:
+def test_outside_of_the_mask_is_outside_of_the_image():
     wide = (9, 3, 4, 8)
-    mask = torch.rand(1, SIDE, SIDE, generator=torch.Generator().manual_seed(6)) < 0.9
+    mask = torch.rand(1, SIDE, SIDE, generator=seeded(6)) < 0.9
     maps = FLAT * mask, photographed(GROOVES, 0.05) * mask, mask.float()
     alone, within = restored(*maps), restored(*(pad(values, wide) for values in maps))
     assert (alone - FLAT * mask).abs().mean() > 0.03
-    torch.testing.assert_close(within, pad(alone, wide), atol=1e-5, rtol=0)
+    assert_close(within, pad(alone, wide), atol=1e-5, rtol=0)
 
 
-def test_nothing_beyond_the_reach_counts() -> None:
+def test_nothing_beyond_the_reach_counts():
     features = photographed(GROOVES, 0.02)
     changed = features.clone()
     changed[:3, :, -1] += 0.5

@@ -67,7 +67,7 @@ def refined_and_not(*surface: Any, **faults: Any) -> tuple[NormalEstimate, Norma
     """Estimate a scene with and without refinement; see `scene`."""
     capture = scene(*surface, **faults)
     estimator = make_estimator("spline-net")
-    estimator.refiner.most_pixels = capture.n_pixels - HALVED  # type: ignore[attr-defined]
+    estimator.refiner.most_pixels = capture.n_pixels - HALVED
     return estimate_normals(capture, estimator), estimate_normals(
         capture, make_estimator("spline-net-pixelwise")
     )
@@ -78,7 +78,7 @@ def mean_error_deg(estimate: NormalEstimate) -> float:
 
 
 @pytest.mark.parametrize(("noise", "most_tilted_deg"), [(0.01, 0.3), (0.03, 0.75)])
-def test_a_noisy_plate_stays_as_flat_as_it_is(noise: float, most_tilted_deg: float) -> None:
+def test_a_noisy_plate_stays_as_flat_as_it_is(noise, most_tilted_deg):
     refined, pixelwise = refined_and_not(PLATE, 0.5, noise=noise)
     assert mean_error_deg(refined) < 1.05 * mean_error_deg(pixelwise)
     mean = unit(refined.normal_map.mean(axis=(0, 1)))
@@ -86,10 +86,10 @@ def test_a_noisy_plate_stays_as_flat_as_it_is(noise: float, most_tilted_deg: flo
 
 
 @pytest.mark.parametrize("gloss", [0.0, 0.5])
-def test_a_checker_of_albedo_leaves_no_more_trace_than_before(gloss: float) -> None:
+def test_a_checker_of_albedo_leaves_no_more_trace_than_before(gloss):
     bright = (ROWS // 8 + COLUMNS // 8) % 2 == 1
 
-    def step_deg(estimate: NormalEstimate) -> float:
+    def step_deg(estimate):
         """The angle between the mean normals of the dark and of the bright squares."""
         dark_mean, bright_mean = (
             unit(estimate.normal_map[part].mean(axis=0)) for part in (~bright, bright)
@@ -115,14 +115,14 @@ def depth(estimate: NormalEstimate, slope: NDArray[np.floating]) -> float:
 
 
 @pytest.mark.parametrize(("width", "gloss"), [(1, 0.0), (1, 0.5), (4, 0.5)])
-def test_grooves_keep_their_depth(width: int, gloss: float) -> None:
+def test_grooves_keep_their_depth(width, gloss):
     normals, slope = grooves(width)
     refined, pixelwise = refined_and_not(normals, 0.5, noise=0.002, gloss=gloss)
     assert depth(refined, slope) == pytest.approx(depth(pixelwise, slope), rel=0.1)
 
 
 @pytest.mark.parametrize(("width", "noise"), [(1, 0.02), (2, 0.002)])
-def test_wrong_light_intensities_do_not_blur_grooves(width: int, noise: float) -> None:
+def test_wrong_light_intensities_do_not_blur_grooves(width, noise):
     """They turn normals by many degrees, which says nothing about detail. The net alone takes most
     of it for noise.
     """
@@ -134,7 +134,7 @@ def test_wrong_light_intensities_do_not_blur_grooves(width: int, noise: float) -
 
 
 @pytest.mark.parametrize("behind", [0.002, 0.3])
-def test_a_background_changes_nothing_on_the_object(behind: float) -> None:
+def test_a_background_changes_nothing_on_the_object(behind):
     """A sphere before a dark or a bright wall, without a mask. A mask would end at the rim of the
     sphere.
     """
@@ -152,7 +152,7 @@ def test_a_background_changes_nothing_on_the_object(behind: float) -> None:
     assert refined < pixelwise + 0.3
 
 
-def test_seams_of_tiles_do_not_show() -> None:
+def test_seams_of_tiles_do_not_show():
     """The margin of a tile is smaller than what the nets can see. Its share of a normal is far
     below its error.
     """
@@ -166,7 +166,7 @@ def test_seams_of_tiles_do_not_show() -> None:
     network = make_estimator("spline-net", MethodOptions(precision="float32")).refiner.network
     found = []
 
-    def lighting_at(chosen: Any) -> PixelLighting:
+    def lighting_at(chosen):
         return PixelLighting(capture.observations[chosen], LIGHTS)
 
     for tile in (TILE, MARGIN):

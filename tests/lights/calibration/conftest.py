@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scenes import spiral_lights
+from scenes import Floats, spiral_lights
 from splinecli.maths.normals import unit
 
 Render = Callable[..., NDArray[np.float32]]
@@ -23,7 +23,7 @@ def render_ball() -> Render:
     """
 
     def render(
-        light: NDArray[np.float64],
+        light: Floats,
         x: float = 103.3,
         y: float = 88.7,
         radius: float = 61.4,
@@ -55,6 +55,6 @@ def render_ball() -> Render:
 
 
 @pytest.fixture
-def lights() -> NDArray[np.float64]:
+def lights() -> Floats:
     """Seven lights (7, 3), 0 to 60 degrees from the view."""
     return spiral_lights(7, 60, 0)

@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from lights.calibration.conftest import Render
-from scenes import decode_rgb
+from scenes import decode_rgb, to_uint16, write_image
 from splinecli.capture import read_light_directions
 from splinecli.errors import InputError
 from splinecli.lights.calibration.balls import calibrate_ball, combine_balls, find_ball_files
@@ -21,7 +21,7 @@ BALL = Circle(103.3, 88.7, 61.4)
 
 def write(folder: Path, name: str, picture: NDArray[np.floating]) -> Path:
     folder.mkdir(exist_ok=True)
-    assert cv2.imwrite(str(folder / name), np.rint(picture.clip(0, 1) * 65535).astype(np.uint16))
+    write_image(folder / name, to_uint16(picture.clip(0, 1) * 65535))
     return folder
 
 
@@ -34,9 +34,7 @@ def ball(tmp_path: Path, render_ball: Render, lights: NDArray[np.float64]) -> Pa
 
 
 @pytest.mark.parametrize("outline", ["--circle", "mask", "picture", "reference"])
-def test_lights_of_a_ball(
-    ball: Path, render_ball: Render, lights: NDArray[np.float64], outline: str
-) -> None:
+def test_lights_of_a_ball(ball, render_ball, lights, outline):
     if outline == "mask":
         write(ball, "mask.png", BALL.inside((180, 210)).astype(np.float64))
     if outline == "reference":
@@ -49,7 +47,7 @@ def test_lights_of_a_ball(
     # A pixel of the ball is 1.9 degrees of light; the outline is found to a fraction of one.
     assert off.max() < (0.8 if outline == "--circle" else 1.8)
     half_way = angle_between_deg(found.normals, np.array((0.0, 0.0, 1.0)))
-    np.testing.assert_allclose(half_way, np.linspace(0, 60, 7) / 2, atol=0.9)
+    assert_allclose(half_way, np.linspace(0, 60, 7) / 2, atol=0.9)
     picture = decode_rgb(calibration_picture((found,)))
     assert picture.shape == (2 * 225, 6 * 200, 3)
     red, green, _ = picture[:225, 200:400].astype(int).transpose(2, 0, 1)
@@ -68,12 +66,12 @@ def test_several_balls_are_averaged(ball, tmp_path, render_ball, lights):
     both = combine_balls([one, other])
     between = angle_between_deg(one.directions, other.directions)
     # Of two directions the mean lies in the middle.
-    np.testing.assert_allclose(both.disagreement_deg, between / 2, atol=1e-6)
+    assert_allclose(both.disagreement_deg, between / 2, atol=1e-6)
     assert between.mean() > 1
     assert combine_balls([one]).disagreement_deg.tolist() == [0] * 7
 
 
-def test_pictures_of_another_size(ball: Path) -> None:
+def test_pictures_of_another_size(ball):
     write(ball, "3.png", np.zeros((50, 60)))
     for circle in (BALL, None):
         with pytest.raises(
@@ -82,7 +80,7 @@ def test_pictures_of_another_size(ball: Path) -> None:
             calibrate_ball(find_ball_files(ball), circle=circle)
 
 
-def test_real_balls(shared_data: Path) -> None:
+def test_real_balls(shared_data):
     chrome = calibrate_ball(find_ball_files(shared_data / "uw/chrome"))
     off = angle_between_deg(
         chrome.directions, read_light_directions(shared_data / "uw/gray/light_directions.txt")

@@ -1,8 +1,5 @@
 """Circles from masks and in pictures."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -19,7 +16,7 @@ def assert_close(found: Circle, true: Circle, pixels: float) -> None:
 
 
 @pytest.mark.parametrize("with_stand", [False, True])
-def test_circle_of_a_mask(with_stand: bool) -> None:
+def test_circle_of_a_mask(with_stand):
     """A stand and specks do not move the circle."""
     mask = TRUE.inside((180, 210))
     if with_stand:
@@ -29,7 +26,7 @@ def test_circle_of_a_mask(with_stand: bool) -> None:
     assert 0.5 < found.visible < 0.9 if with_stand else found.visible > 0.98 and found.spread < 0.5
 
 
-def test_a_mask_cut_off_by_the_frame_keeps_its_circle() -> None:
+def test_a_mask_cut_off_by_the_frame_keeps_its_circle():
     beyond = Circle(40.0, 88.7, 61.4)
     found = circle_from_mask(beyond.inside((180, 210)))
     assert_close(found, beyond, 0.4)
@@ -37,7 +34,7 @@ def test_a_mask_cut_off_by_the_frame_keeps_its_circle() -> None:
     assert not TRUE.reaches_beyond((180, 210))
 
 
-def test_masks_and_pictures_that_are_no_ball() -> None:
+def test_masks_and_pictures_that_are_no_ball():
     for mask in (np.ones((50, 60), np.bool_), np.pad(np.ones((20, 120), np.bool_), 30)):
         with pytest.raises(InputError, match="expected a ball"):
             circle_from_mask(mask)
@@ -47,7 +44,7 @@ def test_masks_and_pictures_that_are_no_ball() -> None:
 
 @pytest.mark.parametrize(("ball", "wall"), [(0.1, 0.9), (0.9, 0.1), (0.01, 0.02)])
 @pytest.mark.parametrize("scale", [1, 6])
-def test_circle_in_a_picture(ball: float, wall: float, scale: int) -> None:
+def test_circle_in_a_picture(ball, wall, scale):
     true = Circle(scale * TRUE.x, scale * TRUE.y, scale * TRUE.radius)
     shape = (180 * scale, 210 * scale)
     picture = np.where(true.inside(shape), ball, wall)
@@ -57,13 +54,13 @@ def test_circle_in_a_picture(ball: float, wall: float, scale: int) -> None:
     assert found.visible > 0.9
 
 
-def test_normals_of_the_ball() -> None:
+def test_normals_of_the_ball():
     normals = Circle(10, 20, 5).normals(np.array([10.0, 13, 10, 16]), np.array([20.0, 20, 16, 20]))
     np.testing.assert_allclose(normals[:3], [(0, 0, 1), (0.6, 0, 0.8), (0, 0.8, 0.6)], atol=1e-12)
     assert np.isnan(normals[3]).any()
 
 
-def test_real_balls(shared_data: Path, record_property: Callable[[str, object], None]) -> None:
+def test_real_balls(shared_data, record_property):
     # PSBox's own circles; their y counts from the lower edge.
     for number in (1, 2):
         folder = shared_data / f"psbox/LightProbe-{number}"

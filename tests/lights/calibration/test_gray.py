@@ -2,30 +2,28 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
-from scenes import write_capture
+from scenes import Floats, to_uint16, write_capture, write_image
 from splinecli.capture.linearise import RadiometricCalibration
 from splinecli.errors import InputError
 from splinecli.lights.calibration.balls import find_ball_files
 from splinecli.lights.calibration.circle import Circle
-from splinecli.lights.calibration.lamps import Target, measure_light_intensities
+from splinecli.lights.calibration.lamps import measure_light_intensities
 
 BALL = Circle(40.0, 42.0, 30.0)
 INTENSITIES = np.array([(1.0, 0.8, 0.6), (0.5, 0.5, 0.7), (1.3, 1.2, 1.0)])
 LIGHTS = np.array([(0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (0.0, -0.48, np.sqrt(1 - 0.48**2))])
 
 
-def write(folder: Path, images: NDArray[np.float64], mask: NDArray[np.bool_] | None) -> Path:
-    return write_capture(
-        folder, np.rint(images * 65535).astype(np.uint16), None, mask=mask, names="{}.png"
-    )
+def write(folder: Path, images: Floats, mask: NDArray[np.bool_] | None) -> Path:
+    return write_capture(folder, to_uint16(images * 65535), None, mask=mask, names="{}.png")
 
 
-def ball_images() -> NDArray[np.float64]:
+def ball_images() -> Floats:
     y, x = np.indices((84, 80)).astype(np.float64)
     normals = np.nan_to_num(BALL.normals(x, y))
     cosine = np.clip(np.einsum("hwi,fi->fhw", normals, LIGHTS), 0, None)
@@ -34,7 +32,7 @@ def ball_images() -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("target", ["card", "ball"])
 @pytest.mark.parametrize("brightest", [1.25, 3.0])
-def test_12_bit_values_in_16_bit_files(tmp_path: Path, target: Target, brightest: float) -> None:
+def test_12_bit_values_in_16_bit_files(tmp_path, target, brightest):
     """One lamp is clipped at 4095, for a share of the target or for all of a card, and no tag says
     so.
     """
@@ -54,20 +52,20 @@ def test_12_bit_values_in_16_bit_files(tmp_path: Path, target: Target, brightest
         return
     found = measure_light_intensities(find_ball_files(folder), lights, target)
     # Only the rim of the ball is left under the brightest lamp, where half a pixel counts most.
-    np.testing.assert_allclose(found[:, 0] / found[0, 0], intensities, rtol=0.03)
+    assert_allclose(found[:, 0] / found[0, 0], intensities, rtol=0.03)
 
 
-def test_images_and_masks_of_another_size_and_a_ball_without_a_mask(tmp_path: Path) -> None:
+def test_images_and_masks_of_another_size_and_a_ball_without_a_mask(tmp_path):
     folder = write(tmp_path / "card", np.full((3, 20, 30, 3), 0.5), None)
     with pytest.raises(InputError, match="images of the gray ball need a mask"):
         measure_light_intensities(find_ball_files(folder), LIGHTS, "ball")
-    cv2.imwrite(str(folder / "1.png"), np.full((20, 31), 30_000, np.uint16))
+    write_image(folder / "1.png", np.full((20, 31), 30_000, np.uint16))
     with pytest.raises(
         InputError, match=r"1\.png: found an image of 31 x 20 pixels, expected 30 x 20 as in 0\.png"
     ):
         measure_light_intensities(find_ball_files(folder), LIGHTS, "card")
-    cv2.imwrite(str(folder / "1.png"), np.full((20, 30), 30_000, np.uint16))
-    cv2.imwrite(str(folder / "mask.png"), np.full((10, 30), 255, np.uint8))
+    write_image(folder / "1.png", np.full((20, 30), 30_000, np.uint16))
+    write_image(folder / "mask.png", np.full((10, 30), 255, np.uint8))
     with pytest.raises(
         InputError,
         match=r"mask\.png: found a mask of 30 x 10 pixels, expected 30 x 20 as in 0\.png",
@@ -76,23 +74,23 @@ def test_images_and_masks_of_another_size_and_a_ball_without_a_mask(tmp_path: Pa
 
 
 @pytest.mark.parametrize("exposure", [1.0, 1.7], ids=["whole", "partly saturated"])
-def test_a_ball(tmp_path: Path, exposure: float) -> None:
+def test_a_ball(tmp_path, exposure):
     images = (ball_images() * exposure).clip(0, 1)
     assert (images == 1).any() == (exposure > 1)
     folder = write(tmp_path / "gray", images, BALL.inside(images.shape[1:3]))
     found = measure_light_intensities(find_ball_files(folder), LIGHTS, "ball")
-    np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=0.01)
+    assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=0.01)
 
 
 @pytest.mark.parametrize(("gamma", "ambient"), [(1.0, 0.0), (2.2, 0.0), (1.0, 0.1)])
-def test_a_card(tmp_path: Path, gamma: float, ambient: float) -> None:
+def test_a_card(tmp_path, gamma, ambient):
     images = np.ones((3, 20, 30, 1)) * 0.4 * (LIGHTS[:, 2, None] * INTENSITIES)[:, None, None]
     folder = write(tmp_path / "card", (images + ambient) ** (1 / gamma), None)
     if ambient:
         stored = np.full((20, 30, 3), round(ambient * 65535), np.uint16)
-        cv2.imwrite(str(folder / "ambient.png"), stored)
+        write_image(folder / "ambient.png", stored)
     radiometry = RadiometricCalibration(gamma)
     found = measure_light_intensities(
         find_ball_files(folder), LIGHTS, "card", radiometry=radiometry
     )
-    np.testing.assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=1e-3)
+    assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=1e-3)

@@ -10,10 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from lights.calibration.conftest import Render
-from scenes import directions_at, spiral_lights
+from scenes import Floats, directions_at, spiral_lights
 from splinecli.lights.calibration.balls import (
     DISTANT,
     SHORTEST_LENS,
@@ -38,13 +37,13 @@ SHAPE = 160, 400
 BALLS = Circle(70, 90, 60), Circle(320, 75, 60)
 
 
-def lamps(distance: float) -> NDArray[np.float64]:
+def lamps(distance: float) -> Floats:
     """Six lamps at 15 to 50 degrees from the view."""
     return distance * spiral_lights(6, 50, 15)
 
 
 def calibrate(
-    folder: Path, render_ball: Render, positions: NDArray[np.float64], *, known: bool = True
+    folder: Path, render_ball: Render, positions: Floats, *, known: bool = True
 ) -> list[BallCalibration]:
     """The balls, with the matrix of a camera that is far away or without one."""
     matrix = folder / "matrix.txt"
@@ -63,7 +62,7 @@ def calibrate(
     return balls
 
 
-def test_rays_that_meet() -> None:
+def test_rays_that_meet():
     points = np.array([(1.0, 2.0, 5.0), (-3.0, 0.5, 4.0), (0.0, 0.0, 9.0)])
     starts = np.array([[(-1.0, 0.0, 0.0)] * 3, [(1.0, 0.2, 0.0)] * 3])
     found, miss = intersect_rays(starts, unit(points - starts))
@@ -77,7 +76,7 @@ PIXELS = (2000, 3000)
 
 def photographed(
     rng: np.random.Generator, camera: float, source: str, *, height: float = 0.0
-) -> tuple[NDArray[np.float64], list[BallCalibration]]:
+) -> tuple[Floats, list[BallCalibration]]:
     """Lamps (6, 3), and two balls of 40 mm as a pinhole camera sees them, 80 mm being the width of
     the object.
 
@@ -93,7 +92,7 @@ def photographed(
     focal = PIXELS[1] * eye[2] / FIELD
     middle = np.array(((PIXELS[1] - 1) / 2, (PIXELS[0] - 1) / 2))
 
-    def image_of(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def image_of(points: Floats) -> Floats:
         seen = points - eye
         return middle + focal * seen[:, :2] / -seen[:, 2:] * (1, -1)
 
@@ -124,7 +123,7 @@ def photographed(
         radius = float(np.hypot(*(outline - (x, y)).T).mean())
         outline += (outline - (x, y)) * (0.3 * rng.normal() / radius) + 0.3 * rng.normal(size=2)
         circle = Circle(float(x), float(y), radius, points=outline)
-        marks = tuple(Highlight(*point, 0.0) for point in highlights.tolist())
+        marks = tuple(Highlight(*point, 0.0) for point in highlights.tolist())  # type: ignore[call-arg]
         files = BallFiles(Path("ball"), (), None, None)
         balls.append(
             BallCalibration(files, circle, "--circle", marks, towards, normals, view, PIXELS)
@@ -133,7 +132,7 @@ def photographed(
 
 
 @pytest.mark.parametrize("source", ["--camera-matrix", "EXIF", "assumed distant"])
-def test_the_uncertainty_covers_the_error(source: str) -> None:
+def test_the_uncertainty_covers_the_error(source):
     """Cameras at 5 to 100 widths of the object: 9 of 10 errors or more are within the stated
     uncertainty.
     """
@@ -156,7 +155,7 @@ def test_the_uncertainty_covers_the_error(source: str) -> None:
         assert np.mean(errors) < 0.03
 
 
-def test_two_balls_give_positions(tmp_path: Path, render_ball: Render) -> None:
+def test_two_balls_give_positions(tmp_path, render_ball):
     """Two balls 250 pixels apart, and lamps 1,200 pixels away: about five times as far."""
     balls = calibrate(tmp_path, render_ball, lamps(1200.0))
     found = triangulate_lamps(balls, ball_diameter=40.0)
@@ -177,7 +176,7 @@ def test_two_balls_give_positions(tmp_path: Path, render_ball: Render) -> None:
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_lamps_without_positions(tmp_path: Path, render_ball: Render, known: bool) -> None:
+def test_lamps_without_positions(tmp_path, render_ball, known):
     """Distant lamps, and near ones that an unknown camera photographs."""
     balls = calibrate(tmp_path, render_ball, lamps(1e6 if known else 1500.0), known=known)
     found = triangulate_lamps(balls)
@@ -196,13 +195,13 @@ def test_lamps_without_positions(tmp_path: Path, render_ball: Render, known: boo
     assert triangulate_lamps(balls[:1]) is None
 
 
-def turned(directions: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
+def turned(directions: Floats, degrees: float) -> Floats:
     """Turn directions (F, 3) about the x axis."""
     cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return directions @ np.array([(1, 0, 0), (0, cosine, sine), (0, -sine, cosine)])
 
 
-def ball(directions: NDArray[np.float64]) -> BallCalibration:
+def ball(directions: Floats) -> BallCalibration:
     files = BallFiles(Path("ball"), (Path("ball/1.png"),) * len(directions), None, None)
     highlights = tuple(Highlight(1.23456, 2.0, 0.25) for _ in directions)
     normals = unit(directions + np.array((0, 0, 1)))
@@ -212,19 +211,19 @@ def ball(directions: NDArray[np.float64]) -> BallCalibration:
     )
 
 
-def report(balls: list[BallCalibration], known: NDArray[np.float64] | None = None) -> dict:
+def report(balls: list[BallCalibration], known: Floats | None = None) -> dict:
     return calibration_report(combine_balls(balls), None, known, picture="calibration.png")
 
 
 @pytest.fixture
-def directions() -> NDArray[np.float64]:
+def directions() -> Floats:
     """Four lights (4, 3) in the plane x, z, so that all turn alike about the x axis where x is
     zero.
     """
     return unit(np.array([(0.0, 0.0, 1.0)] * 4))
 
 
-def test_one_ball(directions: NDArray[np.float64]) -> None:
+def test_one_ball(directions):
     found = report([ball(directions)])
     assert json.loads(json.dumps(found)) == found
     assert (found["n_lights"], found["disagreement_deg"], found["compared"]) == (4, None, None)
@@ -238,7 +237,7 @@ def test_one_ball(directions: NDArray[np.float64]) -> None:
 
 
 @pytest.mark.parametrize(("degrees", "warned"), [(9.8, False), (10.2, True)])
-def test_balls_that_disagree(directions: NDArray[np.float64], degrees: float, warned: bool) -> None:
+def test_balls_that_disagree(directions, degrees, warned):
     # The mean of two directions lies half-way, so each differs from it by half the angle; the limit
     # is 5 degrees.
     found = report([ball(directions), ball(turned(directions, degrees))])
@@ -250,7 +249,7 @@ def test_balls_that_disagree(directions: NDArray[np.float64], degrees: float, wa
     )
 
 
-def test_a_compared_file(directions: NDArray[np.float64]) -> None:
+def test_a_compared_file(directions):
     lights = turned(directions, 40)
     found = report([ball(lights)], turned(lights, 2))
     assert found["compared"] == {"mean_deg": 2.0, "largest_deg": 2.0}

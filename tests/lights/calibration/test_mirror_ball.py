@@ -1,13 +1,9 @@
 """Highlights and directions, against a ball whose reflections are followed to the lamp."""
 
-from pathlib import Path
-
-import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from lights.calibration.conftest import Render
+from scenes import to_uint16, write_image
 from splinecli.errors import InputError
 from splinecli.lights.calibration.balls import (
     ball_centre,
@@ -24,9 +20,7 @@ DISTANT = np.array(((1e6, 0, 104.5), (0, 1e6, 89.5), (0, 0, 1)))
 
 
 @pytest.mark.parametrize("full_scale", [None, 1.0])
-def test_directions_come_back(
-    render_ball: Render, lights: NDArray[np.float64], full_scale: float | None
-) -> None:
+def test_directions_come_back(render_ball, lights, full_scale):
     for light in lights:
         picture = render_ball(light)
         picture = picture if full_scale is None else picture.clip(0, full_scale)
@@ -42,9 +36,7 @@ def test_directions_come_back(
         assert (highlight.saturated > 0.1) == (full_scale is not None)
 
 
-def test_sparkles_and_windows_are_no_lamps(
-    render_ball: Render, lights: NDArray[np.float64]
-) -> None:
+def test_sparkles_and_windows_are_no_lamps(render_ball, lights):
     picture = render_ball(lights[3]).clip(0, 1)
     expected = find_highlight(picture, BALL)
     picture[110, 80] = 1.0
@@ -61,16 +53,16 @@ def test_sparkles_and_windows_are_no_lamps(
             find_highlight(picture, BALL)
 
 
-def test_highlights_near_the_rim(tmp_path: Path, render_ball: Render) -> None:
+def test_highlights_near_the_rim(tmp_path, render_ball):
     picture = render_ball(unit(np.array((1.0, 0.0, -0.3))), lamp=0.9)
-    cv2.imwrite(str(tmp_path / "1.png"), np.rint(picture * 65535).astype(np.uint16))
+    write_image(tmp_path / "1.png", to_uint16(picture * 65535))
     with pytest.raises(InputError, match=r"1\.png: .*level with the ball or behind it"):
         calibrate_ball(find_ball_files(tmp_path), circle=BALL)
 
 
 @pytest.mark.parametrize("distance", [6.0, 50.0, 9e3])
 @pytest.mark.parametrize("side", [0.0, 0.3])
-def test_the_centre_of_a_ball_seen_from_near(distance: float, side: float) -> None:
+def test_the_centre_of_a_ball_seen_from_near(distance, side):
     """Points of a sphere of radius 1 at which the line of sight touches it, seen by a pinhole
     camera.
     """

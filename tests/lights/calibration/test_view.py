@@ -30,7 +30,7 @@ def photograph(path: Path, tags: dict[int, object]) -> Path:
         ({0xA405: 0}, DISTANT),
     ],
 )
-def test_focal_lengths(tmp_path: Path, tags: dict[int, object], focal: float) -> None:
+def test_focal_lengths(tmp_path, tags, focal):
     view = find_view(read_header(photograph(tmp_path / "a.jpg", tags)), None)
     assert view.source == ("assumed distant" if focal == DISTANT else "EXIF")
     np.testing.assert_allclose(
@@ -38,7 +38,7 @@ def test_focal_lengths(tmp_path: Path, tags: dict[int, object], focal: float) ->
     )
 
 
-def test_a_file_comes_first(tmp_path: Path) -> None:
+def test_a_file_comes_first(tmp_path):
     image = photograph(tmp_path / "a.jpg", {0xA405: 50})
     (tmp_path / "m.txt").write_text("700 0 180\n0 710 120\n0 0 1\n")
     assert find_view(read_header(image), tmp_path / "m.txt").matrix[1, 1] == 710

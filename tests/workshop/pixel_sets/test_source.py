@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
-from distributions import generator as seeded
-from small_pixel_sets import MakeSet
+from distributions import seeded
 from splinecli.maths.observation_map import cell_directions
 from splinecli.workshop.pixel_sets.source import (
     FILL_ROUNDS,
@@ -40,7 +40,7 @@ def source_of(
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float16])
-def test_without_faults_observations_are_the_stored_ones(make_set: MakeSet, dtype: type) -> None:
+def test_without_faults_observations_are_the_stored_ones(make_set, dtype):
     pixel_set = make_set(dtype=dtype)
     batch = source_of(pixel_set).draw(200)
     stored = {entry.name: pixel_set.load(entry) for entry in pixel_set.entries}
@@ -71,7 +71,7 @@ def test_without_faults_observations_are_the_stored_ones(make_set: MakeSet, dtyp
     assert seen == {"a", "b", "c"}
 
 
-def test_all_pixels_have_the_same_probability(make_set: MakeSet) -> None:
+def test_all_pixels_have_the_same_probability(make_set):
     pixel_set = make_set()
     normals = source_of(pixel_set).draw(9000).truth.normals.numpy()
     of_b = (normals[:, None] == pixel_set.load(pixel_set.entries[1]).normals).all(axis=2)
@@ -81,7 +81,7 @@ def test_all_pixels_have_the_same_probability(make_set: MakeSet) -> None:
     assert of_b.sum(axis=0) == pytest.approx(np.full(30, 100), abs=4 * np.sqrt(100))
 
 
-def test_a_set_with_fewer_lights_than_asked_for_gives_all_it_has(make_set: MakeSet) -> None:
+def test_a_set_with_fewer_lights_than_asked_for_gives_all_it_has(make_set):
     pixel_set = make_set(entries=[("a", "one", 20, 6), ("b", "two", 20, 12)])
     config = replace(FAULTLESS, min_lights=20, max_lights=20, usual_lights=20)
     batch = source_of(pixel_set, config).draw(100)
@@ -91,7 +91,7 @@ def test_a_set_with_fewer_lights_than_asked_for_gives_all_it_has(make_set: MakeS
     assert all((normals == normal).all(axis=1).any() for normal in batch.truth.normals[few].numpy())
 
 
-def test_pixels_of_a_capture_are_of_one_entry_under_the_same_lights(make_set: MakeSet) -> None:
+def test_pixels_of_a_capture_are_of_one_entry_under_the_same_lights(make_set):
     pixel_set = make_set()
     source = source_of(pixel_set, replace(FAULTLESS, capture_pixels=10))
     names = {
@@ -132,7 +132,7 @@ def analytic_scene(pixels: int = 6) -> tuple[SampledPixels, torch.Tensor]:
 
 
 @pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
-def test_dense_truth_is_the_analytic_map_after_a_rotation(quarter_turns: int) -> None:
+def test_dense_truth_is_the_analytic_map_after_a_rotation(quarter_turns):
     scene, normals = analytic_scene()
     angle = torch.tensor(quarter_turns * torch.pi / 2).expand(6)
     turned = scene.rotate(angle.cos().round(), angle.sin().round())
@@ -142,9 +142,9 @@ def test_dense_truth_is_the_analytic_map_after_a_rotation(quarter_turns: int) ->
     for _ in range(quarter_turns):
         x, y = -y, x
     rotated = torch.stack((x, y, z), dim=1)
-    torch.testing.assert_close(turned.normals, rotated)
+    assert_close(turned.normals, rotated)
     analytic = (cell_directions()[0] @ rotated.T).permute(2, 0, 1)[:, None].clamp(min=0)
-    torch.testing.assert_close(dense.values * dense.known, analytic * dense.known)
+    assert_close(dense.values * dense.known, analytic * dense.known)
     # Interpolated between cells of 1 / 16, where n . l has a slope of about 1; along the rim, where
     # l_z falls steeply and all neighbours lie further in, errors are larger.
     filled = dense.filled - dense.known
@@ -153,7 +153,7 @@ def test_dense_truth_is_the_analytic_map_after_a_rotation(quarter_turns: int) ->
     assert error[..., cell_directions()[0][..., 2] > 0.5].max() < 2 / 16
 
 
-def test_gaps_are_filled_between_lights_and_not_beside_them() -> None:
+def test_gaps_are_filled_between_lights_and_not_beside_them():
     _, inside = cell_directions()
     known, values = torch.zeros(1, 1, 32, 32), torch.zeros(1, 1, 32, 32)
     for row, column, value in ((16, 10, 0.2), (16, 12, 0.6), (5, 20, 0.9)):
@@ -165,7 +165,7 @@ def test_gaps_are_filled_between_lights_and_not_beside_them() -> None:
     assert torch.equal(dense.known, known)
 
 
-def test_nothing_is_filled_outside_the_disc_or_far_from_a_light() -> None:
+def test_nothing_is_filled_outside_the_disc_or_far_from_a_light():
     _, inside = cell_directions()
     known = torch.ones(1, 1, 32, 32)
     known[0, 0, 8:24, 8:24] = 0

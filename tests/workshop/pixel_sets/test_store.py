@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from kills import content, killed_at
-from small_pixel_sets import MakeSet, matte_pixels
+from scenes import read_json
+from small_pixel_sets import matte_pixels
 from splinecli.errors import InputError, OutputError
 from splinecli.system.publishing import held_folder
 from splinecli.workshop.pixel_sets.store import (
@@ -25,11 +26,11 @@ RECIPE = {"scenes": {"lights": 30}, "seed": 1}
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / MANIFEST).read_text())
+    return read_json(folder / MANIFEST)
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
-def test_round_trip(tmp_path: Path, dtype: type) -> None:
+def test_round_trip(tmp_path, dtype):
     folder = tmp_path / "new" / "set"
     writer = PixelSetWriter(folder)
     written = {
@@ -58,7 +59,7 @@ def test_round_trip(tmp_path: Path, dtype: type) -> None:
     assert sorted(path.name for path in folder.iterdir()) == ["a", "b", MANIFEST]
 
 
-def test_continuing_keeps_existing_entries(tmp_path: Path) -> None:
+def test_continuing_keeps_existing_entries(tmp_path):
     PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "a").iterdir()}
     again = PixelSetWriter(tmp_path)
@@ -75,7 +76,7 @@ def test_continuing_keeps_existing_entries(tmp_path: Path) -> None:
     assert len(more.finish().entries) == 3
 
 
-def test_recipes_are_compared(tmp_path: Path) -> None:
+def test_recipes_are_compared(tmp_path):
     PixelSetWriter(tmp_path).add("a", "a", "a test", RECIPE, matte_pixels(7, 5))
     writer = PixelSetWriter(tmp_path)
     assert writer.difference("a", dict(reversed(RECIPE.items()))) is None
@@ -92,7 +93,7 @@ def test_a_replacement_killed_at_any_step_leaves_the_old_set_or_an_unfinished_on
         writer.add("a", "a", "a test", RECIPE, old)
         writer.finish()
 
-        def replace(folder: Path = folder) -> None:
+        def replace(folder=folder):
             PixelSetWriter(folder).add("a", "a", "a test", {"seed": 2}, new)
 
         if not killed_at(step, replace):
@@ -117,7 +118,7 @@ def test_a_replacement_killed_at_any_step_leaves_the_old_set_or_an_unfinished_on
     assert {"seed": 2} in kept
 
 
-def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_with_other_files_is_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("\\begin")
     with pytest.raises(OutputError, match="has files in it but is not a pixel set"):
         PixelSetWriter(tmp_path)
@@ -136,9 +137,7 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_other_and_damaged_manifests_are_left_alone(
-    tmp_path: Path, manifest: dict[str, Any], message: str
-) -> None:
+def test_other_and_damaged_manifests_are_left_alone(tmp_path, manifest, message):
     text = json.dumps(manifest)
     (tmp_path / MANIFEST).write_text(text)
     with pytest.raises(InputError, match=message):
@@ -146,7 +145,7 @@ def test_other_and_damaged_manifests_are_left_alone(
     assert content(tmp_path) == {MANIFEST: text.encode()}
 
 
-def test_a_set_without_entries_is_refused(tmp_path: Path) -> None:
+def test_a_set_without_entries_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"manifest\.json: the pixel set has no entries"):
         PixelSetWriter(tmp_path / "empty").finish()
         open_pixel_set(tmp_path / "empty")
@@ -154,7 +153,7 @@ def test_a_set_without_entries_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("array", ARRAYS)
 @pytest.mark.parametrize("entry", ["a", "b"])
-def test_no_changed_byte_goes_unnoticed(make_set: MakeSet, array: str, entry: str) -> None:
+def test_no_changed_byte_goes_unnoticed(make_set, array, entry):
     folder = make_set().folder
     path = folder / entry / f"{array}.npy"
     whole = path.read_bytes()
@@ -189,7 +188,7 @@ DAMAGED: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.parametrize("damage", DAMAGED)
 @pytest.mark.parametrize("array", ARRAYS)
-def test_a_damaged_array_is_named(make_set: MakeSet, array: str, damage: str) -> None:
+def test_a_damaged_array_is_named(make_set, array, damage):
     """`prepare` loads the arrays of a set to draw its overview,
     without looking at the checksums.
     """
@@ -234,7 +233,7 @@ def test_a_damaged_array_is_named(make_set: MakeSet, array: str, damage: str) ->
         ("name", "d", r"d/observations\.npy: does not match the manifest: found no plain file"),
     ],
 )
-def test_a_changed_manifest(make_set: MakeSet, key: str, value: object, message: str) -> None:
+def test_a_changed_manifest(make_set, key, value, message):
     folder = make_set().folder
     manifest = read_manifest(folder)
     manifest["entries"][0][key] = value
@@ -255,7 +254,7 @@ def test_a_changed_manifest(make_set: MakeSet, key: str, value: object, message:
         (f'{{"format": "{FORMAT}", "complete": true}}', "Object missing required field"),
     ],
 )
-def test_no_manifest(make_set: MakeSet, text: str, message: str) -> None:
+def test_no_manifest(make_set, text, message):
     folder = make_set().folder
     (folder / MANIFEST).write_text(text)
     with pytest.raises(InputError, match=message) as caught:

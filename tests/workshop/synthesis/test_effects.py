@@ -8,11 +8,13 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from scipy import stats
 from torch import Tensor
+from torch.nn.functional import normalize
+from torch.testing import assert_close
 
-from distributions import SHARE, N, assert_uniform, generator
+from distributions import SHARE, N, assert_uniform, seeded
+from scenes import Floats
 from splinecli.maths.normals import angle_between_deg
 from splinecli.maths.observation_map import cell_directions, dot
 from splinecli.maths.transfer import decode_transfer
@@ -30,17 +32,17 @@ from splinecli.workshop.synthesis.pixels import Wall, draw_ambient, draw_visible
 from splinecli.workshop.synthesis.principled import PrincipledMaterial
 
 
-def test_walls_have_the_stated_shapes() -> None:
-    normals = draw_visible_normals(N, generator(1))
-    wall = draw_wall(normals, 0.4, generator())
+def test_walls_have_the_stated_shapes():
+    normals = draw_visible_normals(N, seeded(1))
+    wall = draw_wall(normals, 0.4, seeded())
     present = wall.tan_height[:, 0] > 0
     assert present.float().mean().item() == pytest.approx(0.4, abs=SHARE)
     assert_uniform(torch.rad2deg(wall.tan_height[present].atan()), 8, 75)
     assert_uniform(torch.rad2deg(wall.tan_half_width.atan()), 15, 88)
     assert_uniform(wall.softness, 0.01, 0.06)
     assert_uniform(torch.rad2deg(wall.facing[:, 2].asin()), 0, 60)
-    torch.testing.assert_close(wall.facing.norm(dim=1), torch.ones(N))
-    torch.testing.assert_close(wall.azimuth.norm(dim=1), torch.ones(N))
+    assert_close(wall.facing.norm(dim=1), torch.ones(N))
+    assert_close(wall.azimuth.norm(dim=1), torch.ones(N))
     assert not wall.azimuth[:, 2].any()
     # It faces back over the pixel.
     assert dot(wall.facing, wall.azimuth[:1])[0, 0] < 0
@@ -48,7 +50,7 @@ def test_walls_have_the_stated_shapes() -> None:
     assert not wall.reflectance[~present].any()
     assert wall.has_pixel_material.float().mean().item() == pytest.approx(0.5, abs=SHARE)
     # What reflects lies on the wall, on the side that faces the pixel.
-    torch.testing.assert_close(wall.towards.norm(dim=1), torch.ones(N))
+    assert_close(wall.towards.norm(dim=1), torch.ones(N))
     along = (wall.towards * wall.azimuth).sum(dim=1)
     assert (wall.towards[present, 2] < wall.tan_height[present, 0] * along[present]).all()
     assert ((wall.facing * wall.towards).sum(dim=1) < 0).all()
@@ -75,10 +77,10 @@ def mirror(pixels: int) -> PrincipledMaterial:
     )
 
 
-def test_matte_walls_reflect_by_the_cosine_law_twice() -> None:
-    normals = draw_visible_normals(50, generator(1))
+def test_matte_walls_reflect_by_the_cosine_law_twice():
+    normals = draw_visible_normals(50, seeded(1))
     wall = replace(
-        draw_wall(normals, 1.0, generator()),
+        draw_wall(normals, 1.0, seeded()),
         has_pixel_material=torch.zeros(50, 1, dtype=torch.bool),
     )
     directions, inside = cell_directions()
@@ -88,11 +90,11 @@ def test_matte_walls_reflect_by_the_cosine_law_twice() -> None:
     returned = wall.reflected(normals, matte(50), directions[inside])
     # An interface of no reflectance at normal incidence still mirrors a little at grazing angles.
     steep = normals[:, 2] > 0.5
-    torch.testing.assert_close(returned[steep], expected[steep], rtol=0, atol=5e-3)
+    assert_close(returned[steep], expected[steep], rtol=0, atol=5e-3)
     assert not wall.reflected(normals, matte(50), -wall.facing[:, None]).any()
 
 
-def test_a_metal_wall_throws_its_highlight_where_the_metal_shows_it() -> None:
+def test_a_metal_wall_throws_its_highlight_where_the_metal_shows_it():
     """Light, wall and pixel set up as two mirrors: light comes from the side, by way of the wall,
     to the camera.
     """
@@ -111,16 +113,16 @@ def test_a_metal_wall_throws_its_highlight_where_the_metal_shows_it() -> None:
     assert wall.reflected(away, mirror(1), lights).max() < 0.5
 
 
-def test_a_known_wall_hides_the_lights_behind_it() -> None:
+def test_a_known_wall_hides_the_lights_behind_it():
     wall = replace(
-        draw_wall(draw_visible_normals(1, generator()), 1.0, generator()),
+        draw_wall(draw_visible_normals(1, seeded()), 1.0, seeded()),
         azimuth=torch.tensor([[0.0, 1.0, 0.0]]),
         tan_height=torch.tensor([[1.0]]),
         tan_half_width=torch.tensor([[math.tan(math.radians(30))]]),
         softness=torch.tensor([[0.01]]),
     )
 
-    def towards(azimuth_deg: float, elevation_deg: float) -> list[float]:
+    def towards(azimuth_deg, elevation_deg):
         a, e = math.radians(azimuth_deg), math.radians(elevation_deg)
         return [math.cos(e) * math.sin(a), math.cos(e) * math.cos(a), math.sin(e)]
 
@@ -134,25 +136,25 @@ def test_a_known_wall_hides_the_lights_behind_it() -> None:
     assert wall.visibility(lights)[0].tolist() == [0, 1, 0, 1, 0, 1, 1]
 
 
-def test_ambient_light() -> None:
-    ambient = draw_ambient(N, 0.3, generator())
+def test_ambient_light():
+    ambient = draw_ambient(N, 0.3, seeded())
     assert ambient.shape == (N, 1) and (ambient > 0).float().mean().item() == pytest.approx(
         0.3, abs=SHARE
     )
     assert_uniform(ambient[ambient > 0].log10(), -3.5, -1.3)
-    assert not draw_ambient(N, 0.0, generator()).any()
+    assert not draw_ambient(N, 0.0, seeded()).any()
 
 
 def tilted_lights(pixels: int, lights: int) -> Tensor:
-    directions = torch.randn(pixels, lights, 3, generator=generator(3))
+    directions = torch.randn(pixels, lights, 3, generator=seeded(3))
     directions[..., 2] = directions[..., 2].abs() + 0.5
-    return torch.nn.functional.normalize(directions, dim=-1)
+    return normalize(directions, dim=-1)
 
 
-def test_errors_of_light_directions() -> None:
+def test_errors_of_light_directions():
     directions = tilted_lights(4000, 40)
-    moved = disturb_light_directions(directions, 0.6, generator())
-    torch.testing.assert_close(moved.norm(dim=-1), torch.ones(4000, 40))
+    moved = disturb_light_directions(directions, 0.6, seeded())
+    assert_close(moved.norm(dim=-1), torch.ones(4000, 40))
     assert (moved[..., 2] > 0).all()
     error = angle_between_deg(moved.numpy(), directions.numpy())
     # A pixel's angles have two components of its sigma each: sigma^2 is half of their mean square.
@@ -163,24 +165,24 @@ def test_errors_of_light_directions() -> None:
     assert stats.kstest(sigma[disturbed], lambda x: (x / 8).clip(0, 1) ** (1 / 3)).statistic < 0.04
     assert 6 < sigma.max() < 10
     np.testing.assert_allclose(
-        disturb_light_directions(directions, 0.0, generator()), directions, atol=1e-6
+        disturb_light_directions(directions, 0.0, seeded()), directions, atol=1e-6
     )
 
 
-def test_errors_of_light_intensities() -> None:
-    observations = torch.rand(4000, 100, generator=generator(3)) + 0.5
-    factor = (disturb_light_intensities(observations, 0.6, generator()) / observations).numpy()
+def test_errors_of_light_intensities():
+    observations = torch.rand(4000, 100, generator=seeded(3)) + 0.5
+    factor = (disturb_light_intensities(observations, 0.6, seeded()) / observations).numpy()
     sigma = np.sqrt(((factor - 1) ** 2).mean(axis=1))
     disturbed = sigma > 1e-5
     assert disturbed.mean() == pytest.approx(0.6, abs=0.03)
     assert stats.kstest(sigma[disturbed], stats.uniform(0, 0.05).cdf).statistic < 0.04
     assert factor[disturbed].mean() == pytest.approx(1, abs=1e-3)
-    assert torch.equal(disturb_light_intensities(observations, 0.0, generator()), observations)
+    assert torch.equal(disturb_light_intensities(observations, 0.0, seeded()), observations)
 
 
-def test_exposure() -> None:
-    radiance = torch.rand(N, 5, generator=generator(3)) * 30
-    brightest = (radiance * draw_exposure(radiance, 0.25, generator())).amax(dim=1)
+def test_exposure():
+    radiance = torch.rand(N, 5, generator=seeded(3)) * 30
+    brightest = (radiance * draw_exposure(radiance, 0.25, seeded())).amax(dim=1)
     over = brightest > 1
     assert over.float().mean().item() == pytest.approx(0.25, abs=SHARE)
     assert_uniform(brightest[over], 1, 3)
@@ -189,9 +191,9 @@ def test_exposure() -> None:
     assert dark[~over].float().mean().item() == pytest.approx(0.4 * 0.7, abs=SHARE)
     assert_uniform(brightest[dark].log10(), -2.7, -1.3)
     assert brightest.min() >= 10**-2.7 * 0.999
-    unclipped = (radiance * draw_exposure(radiance, 0.0, generator())).amax(dim=1)
+    unclipped = (radiance * draw_exposure(radiance, 0.0, seeded())).amax(dim=1)
     assert unclipped.max() <= 1 + 1e-6
-    assert torch.isfinite(draw_exposure(torch.zeros(3, 5), 0.5, generator())).all()
+    assert torch.isfinite(draw_exposure(torch.zeros(3, 5), 0.5, seeded())).all()
 
 
 def mean_square_of_power(low: float, high: float) -> float:
@@ -200,8 +202,8 @@ def mean_square_of_power(low: float, high: float) -> float:
 
 
 @pytest.mark.parametrize("level", [0.5, 0.1])
-def test_sensor_noise(level: float) -> None:
-    noisy = add_sensor_noise(torch.full((N, 20), level), generator())
+def test_sensor_noise(level):
+    noisy = add_sensor_noise(torch.full((N, 20), level), seeded())
     expected = mean_square_of_power(-4, -2.5) + level * mean_square_of_power(-3.5, -2)
     variance = (noisy.double() - level).square().mean().item()
     assert variance == pytest.approx(expected, rel=0.05)
@@ -213,9 +215,9 @@ def is_multiple(values: Tensor, steps: float) -> Tensor:
     return ((values * steps - (values * steps).round()).abs() < 1e-6).all(dim=1)
 
 
-def test_quantisation() -> None:
-    exposed = torch.rand(N, 8, generator=generator(3), dtype=torch.float64)
-    quantised = quantise(exposed, 0.3, generator())
+def test_quantisation():
+    exposed = torch.rand(N, 8, generator=seeded(3), dtype=torch.float64)
+    quantised = quantise(exposed, 0.3, seeded())
     decoded = torch.from_numpy(
         decode_transfer(np.arange(256, dtype=np.float32) / 255, None)
     ).double()
@@ -234,31 +236,29 @@ def test_quantisation() -> None:
         other = is_multiple(quantised, 2**bits - 1) & ~eight & ~of_srgb
         assert other.double().mean().item() == pytest.approx(0.7 / 4, abs=SHARE)
         assert error[other].abs().max().item() == pytest.approx(0.5 / (2**bits - 1), rel=0.01)
-    assert (quantise(exposed, 0.0, generator()) - exposed).abs().max() <= 0.5 / 1023 + 1e-9
+    assert (quantise(exposed, 0.0, seeded()) - exposed).abs().max() <= 0.5 / 1023 + 1e-9
 
 
-def test_light_intensities() -> None:
-    intensities = draw_light_intensities(N, 10, 0.4, generator())
+def test_light_intensities():
+    intensities = draw_light_intensities(N, 10, 0.4, seeded())
     assert intensities.amax(dim=1).sub(1).abs().max() == 0
     unequal = intensities.amin(dim=1) < 1
     assert unequal.float().mean().item() == pytest.approx(0.4, abs=SHARE)
     # The largest of ten of 2^U(-2, 0) is 2^-0.18 on average, so all others are below the range's
     # upper end by that.
     assert intensities.min() >= 0.25
-    assert not (draw_light_intensities(N, 10, 0.0, generator()) != 1).any()
+    assert not (draw_light_intensities(N, 10, 0.0, seeded()) != 1).any()
 
 
-def test_restoring_half_of_the_clipped_pixels() -> None:
+def test_restoring_half_of_the_clipped_pixels():
     lights = tilted_lights(400, 12)
-    normals = torch.nn.functional.normalize(
-        torch.randn(400, 3, generator=generator(5)) * 0.3 + torch.tensor((0, 0, 1))
-    )
+    normals = normalize(torch.randn(400, 3, generator=seeded(5)) * 0.3 + torch.tensor((0, 0, 1)))
     truth = (lights * normals[:, None]).sum(dim=2).clamp(min=0)
     truth = 1.4 * truth / truth.amax(dim=1, keepdim=True)
     valid = torch.arange(12).expand(400, 12) < 10
     clipped = (truth > 1) & valid
     stored = truth.clamp(max=1) * valid
-    restored = restore(stored, clipped, lights, valid, generator())
+    restored = restore(stored, clipped, lights, valid, seeded())
     changed = (restored != stored).any(dim=1)
     assert changed.float().mean().item() == pytest.approx(0.5, abs=0.08)
     assert not (restored != stored)[~clipped].any()
@@ -268,24 +268,24 @@ def test_restoring_half_of_the_clipped_pixels() -> None:
     assert (restored - truth)[known][clipped[known]].abs().max() < 0.02
 
 
-def draw_rigs(kind: str, pixels: int, lights: int) -> NDArray[np.float64]:
-    random = torch.Generator().manual_seed(0)
+def draw_rigs(kind: str, pixels: int, lights: int) -> Floats:
+    random = seeded(0)
     return draw_light_directions(pixels, lights, random, {kind: 1.0}).double().numpy()
 
 
-def centred_rigs(kind: str, pixels: int, lights: int) -> NDArray[np.float64]:
+def centred_rigs(kind: str, pixels: int, lights: int) -> Floats:
     points = draw_rigs(kind, pixels, lights)[..., :2]
     return points - points.mean(axis=1, keepdims=True)
 
 
-def test_half_of_the_draws_have_about_the_usual_number() -> None:
-    random = torch.Generator().manual_seed(0)
+def test_half_of_the_draws_have_about_the_usual_number():
+    random = seeded(0)
     draws = [draw_light_counts(50, 4, 96, 10, random).numpy() for _ in range(4000)]
     largest = np.array([counts.max() for counts in draws])
     assert largest.min() >= 4
     assert largest.max() >= 90
 
-    def log_uniform(most: int) -> float:
+    def log_uniform(most):
         return math.log((most + 1) / 4) / math.log(97 / 4)
 
     # Four standard deviations of a share of 4000 are at most 0.03.
@@ -295,14 +295,14 @@ def test_half_of_the_draws_have_about_the_usual_number() -> None:
     assert all(counts.min() >= np.floor(0.8 * counts.max()) for counts in draws)
 
 
-def test_directions_are_unit_vectors_above_the_horizon() -> None:
-    directions = draw_light_directions(2000, 30, torch.Generator().manual_seed(0))
+def test_directions_are_unit_vectors_above_the_horizon():
+    directions = draw_light_directions(2000, 30, seeded(0))
     assert directions.shape == (2000, 30, 3) and directions.norm(dim=-1).sub(1).abs().max() < 1e-6
     # Nothing lies outside 0.996 of the disc, where z = sqrt(1 - 0.996^2) = 0.0894.
     assert directions[..., 2].min() == pytest.approx(0.0894, abs=1e-3)
 
 
-def test_rigs_are_ellipses_of_the_stated_axes() -> None:
+def test_rigs_are_ellipses_of_the_stated_axes():
     centred = centred_rigs("ellipse", 1500, 1000)
     # A uniform ellipse has variances of a quarter of its half-axes squared.
     axes = 2 * np.sqrt(np.linalg.eigvalsh(np.einsum("pfi,pfj->pij", centred, centred) / 1000))
@@ -318,7 +318,7 @@ def test_rigs_are_ellipses_of_the_stated_axes() -> None:
     )
 
 
-def test_cones_are_narrow() -> None:
+def test_cones_are_narrow():
     centred = centred_rigs("cone", 500, 400)
     radius_deg = np.degrees(np.arcsin(np.linalg.norm(centred, axis=2).max(axis=1)))
     # The mean of 400 lights is off by some hundredths of the radius.
@@ -326,7 +326,7 @@ def test_cones_are_narrow() -> None:
     assert radius_deg.max() < 22
 
 
-def test_rings_have_one_elevation() -> None:
+def test_rings_have_one_elevation():
     directions = draw_rigs("ring", 500, 200)
     polar_deg = np.degrees(np.arccos(directions[..., 2]))
     assert stats.kstest(polar_deg.mean(axis=1), stats.uniform(15, 60).cdf).statistic < 0.08
@@ -340,13 +340,13 @@ def test_rings_have_one_elevation() -> None:
     assert off_axis.max() < math.sin(math.radians(60)) / math.radians(60) + 0.05
 
 
-def test_lines_lie_nearly_in_a_plane() -> None:
+def test_lines_lie_nearly_in_a_plane():
     centred = centred_rigs("line", 500, 400)
     across = np.sqrt(np.linalg.eigvalsh(np.einsum("pfi,pfj->pij", centred, centred) / 400)[:, 0])
     assert stats.kstest(np.degrees(np.arcsin(across)), stats.uniform(1, 9).cdf).statistic < 0.1
 
 
-def test_hand_held_lights_come_in_clusters() -> None:
+def test_hand_held_lights_come_in_clusters():
     directions = draw_rigs("hand-held", 500, 12)
     angles = np.degrees(np.arccos(np.clip(directions @ directions.transpose(0, 2, 1), -1, 1)))
     angles += 360 * np.eye(12)

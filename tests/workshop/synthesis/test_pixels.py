@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 from scipy import stats
+from torch.testing import assert_close
 
+from distributions import seeded
 from splinecli.maths.observation_map import cell_directions
+from splinecli.workshop.synthesis.batches import PixelBatch
 from splinecli.workshop.synthesis.pixels import (
-    PixelBatch,
     PixelGenerator,
     PixelGeneratorConfig,
     draw_scene,
@@ -27,12 +29,10 @@ NOTHING = replace(PLAIN, wall_share=0.0, second_wall_share=0.0, ambient_share=0.
 
 
 def draw(pixels: int, config: PixelGeneratorConfig | None = None, seed: int = 0) -> PixelBatch:
-    return PixelGenerator(
-        config or PixelGeneratorConfig(), torch.Generator().manual_seed(seed)
-    ).draw(pixels)
+    return PixelGenerator(config or PixelGeneratorConfig(), seeded(seed)).draw(pixels)
 
 
-def test_batches_hold_what_a_capture_would() -> None:
+def test_batches_hold_what_a_capture_would():
     batch = draw(4000)
     pixels, lights = batch.observations.shape
     assert pixels == 4000
@@ -55,9 +55,9 @@ def test_batches_hold_what_a_capture_would() -> None:
 
 
 @pytest.mark.parametrize("config", [PixelGeneratorConfig(), PixelGeneratorConfig(mixed_share=1.0)])
-def test_each_pixel_is_turned_by_its_own_angle(config: PixelGeneratorConfig) -> None:
-    scene = draw_scene(100, config, torch.Generator().manual_seed(0))
-    angle = 2 * torch.pi * torch.rand(100, generator=torch.Generator().manual_seed(1))
+def test_each_pixel_is_turned_by_its_own_angle(config):
+    scene = draw_scene(100, config, seeded(0))
+    angle = 2 * torch.pi * torch.rand(100, generator=seeded(1))
     turned = scene.rotate(angle.cos(), angle.sin())
     # Turning scene and lights together changes nothing.
     directions, inside = cell_directions()
@@ -65,22 +65,18 @@ def test_each_pixel_is_turned_by_its_own_angle(config: PixelGeneratorConfig) -> 
     c, s = angle.cos()[:, None], angle.sin()[:, None]
     x, y, z = lights.unbind(-1)
     turned_lights = torch.stack((c * x - s * y, s * x + c * y, z), dim=-1)
-    torch.testing.assert_close(
-        turned.radiance(turned_lights), scene.radiance(lights), rtol=2e-3, atol=1e-4
-    )
+    assert_close(turned.radiance(turned_lights), scene.radiance(lights), rtol=2e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize(
     "share", ["wall_share", "second_wall_share", "ambient_share", "mixed_share"]
 )
-def test_each_effect_shows_in_the_scene_and_can_be_switched_off(share: str) -> None:
-    def dense(config: PixelGeneratorConfig) -> torch.Tensor:
-        return draw_scene(400, config, torch.Generator().manual_seed(0)).dense_truth().values
+def test_each_effect_shows_in_the_scene_and_can_be_switched_off(share):
+    def dense(config):
+        return draw_scene(400, config, seeded(0)).dense_truth().values
 
     assert (dense(replace(NOTHING, **{share: 1.0})) - dense(NOTHING)).abs().max() > 0.01
-    off = draw_scene(
-        400, replace(PixelGeneratorConfig(), **{share: 0.0}), torch.Generator().manual_seed(0)
-    )
+    off = draw_scene(400, replace(PixelGeneratorConfig(), **{share: 0.0}), seeded(0))
     if share == "mixed_share":
         assert off.mixed is None
     elif share == "ambient_share":
@@ -89,16 +85,14 @@ def test_each_effect_shows_in_the_scene_and_can_be_switched_off(share: str) -> N
         assert len(off.walls) == 1
 
 
-def test_mixed_pixels_lie_between_their_surfaces() -> None:
-    scene = draw_scene(400, replace(NOTHING, mixed_share=0.5), torch.Generator().manual_seed(0))
+def test_mixed_pixels_lie_between_their_surfaces():
+    scene = draw_scene(400, replace(NOTHING, mixed_share=0.5), seeded(0))
     assert len(scene.mixed.normals) == len(scene.mixed_weight) == 200
     lights = cell_directions()[0][cell_directions()[1]]
     alone = replace(scene, mixed=None, mixed_weight=None).radiance(lights)
     second, blended = scene.mixed.radiance(lights), scene.radiance(lights)
     weight = scene.mixed_weight
-    torch.testing.assert_close(
-        blended[:200], (1 - weight) * alone[:200] + weight * second, rtol=1e-4, atol=1e-5
-    )
+    assert_close(blended[:200], (1 - weight) * alone[:200] + weight * second, rtol=1e-4, atol=1e-5)
     assert torch.equal(blended[200:], alone[200:])
     # Edges have another normal and the same material; blends the reverse.
     edge = torch.arange(200) % 2 == 0
@@ -109,8 +103,8 @@ def test_mixed_pixels_lie_between_their_surfaces() -> None:
     assert weight[edge].max() <= 0.4 < weight[~edge].max() <= 0.7
 
 
-def test_normals_are_spread_as_on_a_sphere_s_picture() -> None:
-    normals = draw_visible_normals(20_000, torch.Generator().manual_seed(0)).double()
+def test_normals_are_spread_as_on_a_sphere_s_picture():
+    normals = draw_visible_normals(20_000, seeded(0)).double()
     assert normals.norm(dim=1).sub(1).abs().max() < 1e-6
     assert (normals[:, 2] > 0).all()
     # Uniform by projected area: r^2 is uniform over 0..0.997^2, and so is the azimuth over the
@@ -124,7 +118,7 @@ def test_normals_are_spread_as_on_a_sphere_s_picture() -> None:
 SHARED = replace(NOTHING, capture_pixels=16, unequal_lights_share=0.0)
 
 
-def test_pixels_of_a_capture_share_its_lights_and_its_exposure() -> None:
+def test_pixels_of_a_capture_share_its_lights_and_its_exposure():
     batch = draw(160, replace(SHARED, light_direction_error_share=1.0))
     assert batch.captures == 10
     # Pixel p belongs to capture p % 10.
@@ -134,18 +128,16 @@ def test_pixels_of_a_capture_share_its_lights_and_its_exposure() -> None:
     assert len(batch.exposure.unique()) == 10
     # Without noise, they show the radiance of their true lights at that exposure.
     exact = draw(160, SHARED)
-    radiance = exact.truth.radiance(exact.light_directions) * exact.exposure * exact.valid
+    radiance = exact.truth.radiance(exact.light_directions) * exact.exposure * exact.valid  # type: ignore[attr-defined]
     clipped = radiance > 1
-    torch.testing.assert_close(
-        exact.observations[~clipped], radiance[~clipped], rtol=1e-4, atol=1e-6
-    )
+    assert_close(exact.observations[~clipped], radiance[~clipped], rtol=1e-4, atol=1e-6)
     brightest = exact.observations.unflatten(0, (16, 10)).amax(dim=(0, 2))
     assert (brightest > 0.15).all() and (brightest <= 1).all()
     assert draw(10, SHARED).captures == 1  # of fewer pixels than usual
 
 
-def test_a_capture_has_few_materials() -> None:
-    material = draw_shared_materials(64 * 2000, 2000, torch.Generator().manual_seed(0))
+def test_a_capture_has_few_materials():
+    material = draw_shared_materials(64 * 2000, 2000, seeded(0))
     base, roughness = (values.view(64, 2000).T for values in (material.base, material.roughness))
     counts = np.array([len(values.unique()) for values in base])
     assert counts.max() == 8

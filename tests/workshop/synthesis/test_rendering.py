@@ -11,6 +11,9 @@ from torch import Tensor
 
 pytest.importorskip("embreex", reason="needs the extra 'render'")
 
+from numpy.testing import assert_allclose
+
+from distributions import seeded
 from point_lights import render_point_lights
 from splinecli.workshop.synthesis import scenes as rendering
 from splinecli.workshop.synthesis.meshes import Mesh
@@ -84,7 +87,7 @@ def directions(*vectors: tuple[float, float, float]) -> np.ndarray:
     return lights / np.linalg.norm(lights, axis=1, keepdims=True)
 
 
-def test_a_matte_ball_is_lambert_s_law_and_lights_nothing_of_itself() -> None:
+def test_a_matte_ball_is_lambert_s_law_and_lights_nothing_of_itself():
     tracer = Tracer(ball(0.9, polar=90, inward=False))
     visible = find_visible_surface(tracer, 64, 3)
     centres = pixel_centres(visible.mask)
@@ -105,9 +108,7 @@ def test_a_matte_ball_is_lambert_s_law_and_lights_nothing_of_itself() -> None:
     # nearly.
     assert np.abs(direct - expected)[well_inside].max() < 0.02
     assert np.abs(direct - expected)[well_inside].mean() < 0.002
-    indirect = render_indirect(
-        *parts, directions=16, bounces=3, generator=torch.Generator().manual_seed(0)
-    )["matte"]
+    indirect = render_indirect(*parts, directions=16, bounces=3, generator=seeded(0))["matte"]
     assert indirect.abs().max() == 0
 
 
@@ -122,7 +123,7 @@ def floor_with_wall() -> Mesh:
     )
 
 
-def test_a_wall_casts_its_shadow() -> None:
+def test_a_wall_casts_its_shadow():
     tracer = Tracer(floor_with_wall())
     visible = find_visible_surface(tracer, 50, 2)
     # At 45 degrees behind the wall the shadow is as long as the wall is high; from the front there
@@ -135,16 +136,16 @@ def test_a_wall_casts_its_shadow() -> None:
     in_shadow = (x > -0.2 + 0.04) & (x < 0.2 - 0.04)
     in_light = (x < -0.2 - 0.04) | (x > 0.2 + 0.04)
     assert np.abs(direct[in_shadow, 0]).max() == 0
-    np.testing.assert_allclose(direct[in_light, 0], np.sqrt(0.5), rtol=1e-5)
+    assert_allclose(direct[in_light, 0], np.sqrt(0.5), rtol=1e-5)
     beside = np.abs(x - 0.2) > 0.04
     lit = direct[beside, 1]
-    np.testing.assert_allclose(lit[x[beside] < 0.2], np.sqrt(0.5), rtol=1e-5)
+    assert_allclose(lit[x[beside] < 0.2], np.sqrt(0.5), rtol=1e-5)
     # Behind the wall, it is the other way round.
     behind = (x > 0.2 + 0.04) & (x < 0.6 - 0.04)
     assert np.abs(direct[behind, 1]).max() == 0
 
 
-def test_a_point_of_light_follows_lamberts_law_and_the_wall_throws_its_shadow() -> None:
+def test_a_point_of_light_follows_lamberts_law_and_the_wall_throws_its_shadow():
     """The cosine is h / d and the falloff (d0 / d)^2, so the radiance is albedo h d0^2 / d^3."""
     tracer = Tracer(floor_with_wall())
     visible = find_visible_surface(tracer, 50, 1)
@@ -160,12 +161,12 @@ def test_a_point_of_light_follows_lamberts_law_and_the_wall_throws_its_shadow() 
     clear = ~((share > 0) & (share * lamps[:, 2] < 0.4))
     # the wall ends at 1
     sure = (np.abs(share * lamps[:, 2] - 0.4) > 0.02) & (np.abs(points[:, 1:2]) < 0.8)
-    np.testing.assert_allclose(found[sure], (expected * clear)[sure], rtol=1e-5)
+    assert_allclose(found[sure], (expected * clear)[sure], rtol=1e-5)
     assert 0.1 < clear[sure].mean() < 0.95
 
 
 @pytest.mark.parametrize("bounces", [1, 4])
-def test_light_between_the_walls_of_a_bowl(bounces: int) -> None:
+def test_light_between_the_walls_of_a_bowl(bounces):
     # From any point of a sphere every part of it of area dA has the form factor dA / (4 pi R^2). A
     # half sphere of reflectance rho, its mouth to the light: the flux pi R^2 falls in, rho of it is
     # spread evenly, and of what is spread a half meets the bowl again.
@@ -174,7 +175,7 @@ def test_light_between_the_walls_of_a_bowl(bounces: int) -> None:
     visible = find_visible_surface(tracer, 24, 3)
     lights = directions((0, 0, 1))
     parts = (tracer, visible, lights, matte(rho), np.zeros(len(tracer.mesh.faces), np.int64))
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     indirect = render_indirect(*parts, directions=256, bounces=bounces, generator=generator)[
         "matte"
     ].numpy()[:, 0]
@@ -188,7 +189,7 @@ def test_light_between_the_walls_of_a_bowl(bounces: int) -> None:
         assert indirect[part].mean() == pytest.approx(expected, rel=0.05)
 
 
-def test_patches_have_their_own_material() -> None:
+def test_patches_have_their_own_material():
     tracer = Tracer(floor_with_wall())
     visible = find_visible_surface(tracer, 20, 2)
     materials = {"matte": Matte(torch.tensor([[0.25], [1.0]]))}
@@ -198,11 +199,11 @@ def test_patches_have_their_own_material() -> None:
     ][:, 0]
     x, y = pixel_centres(visible.mask).T
     below, above = y < x - 0.11, y > x + 0.11
-    np.testing.assert_allclose(direct[below], 0.25, rtol=1e-5)
-    np.testing.assert_allclose(direct[above], 1.0, rtol=1e-5)
+    assert_allclose(direct[below], 0.25, rtol=1e-5)
+    assert_allclose(direct[above], 1.0, rtol=1e-5)
 
 
-def test_pixels_on_the_outline_are_as_bright_as_their_share_of_the_surface() -> None:
+def test_pixels_on_the_outline_are_as_bright_as_their_share_of_the_surface():
     corners = np.array([(-0.5, -0.5, 0), (0.7, -0.5, 0), (0.7, 0.5, 0), (-0.5, 0.5, 0)], np.float32)
     up = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
     tracer = Tracer(Mesh(corners, np.array([(0, 1, 2), (0, 2, 3)], np.int32), up))
@@ -214,7 +215,7 @@ def test_pixels_on_the_outline_are_as_bright_as_their_share_of_the_surface() -> 
     )["matte"]
     picture = np.zeros((10, 10))
     picture[visible.mask] = direct[:, 0]
-    np.testing.assert_allclose(picture[3:7, 3:8], 1, rtol=1e-6)
+    assert_allclose(picture[3:7, 3:8], 1, rtol=1e-6)
     assert visible.coverage.min() > 0.5
-    np.testing.assert_allclose(direct[:, 0].numpy(), visible.coverage, rtol=1e-6)
+    assert_allclose(direct[:, 0].numpy(), visible.coverage, rtol=1e-6)
     assert picture.sum() == pytest.approx(1.2 / 0.04, rel=0.1)

@@ -5,6 +5,7 @@ import pytest
 
 pytest.importorskip("embreex", reason="needs the extra 'render'")
 
+from splinecli.maths.normals import unit
 from splinecli.workshop.synthesis.meshes import Mesh
 from splinecli.workshop.synthesis.scenes import (
     MATERIALS,
@@ -31,7 +32,7 @@ def tent() -> Mesh:
     return Mesh(corners, faces, normals.astype(np.float32))
 
 
-def test_a_scene_depends_on_its_seed_and_index_alone() -> None:
+def test_a_scene_depends_on_its_seed_and_index_alone():
     scenes = [draw_scene(7, index, SMALL, tent()) for index in (0, 1, 0)]
     rendered = [render_scene(scene, SMALL) for scene in scenes]
     for name in MATERIALS:
@@ -41,7 +42,7 @@ def test_a_scene_depends_on_its_seed_and_index_alone() -> None:
         assert not np.array_equal(scenes[0].lights, other.lights)
 
 
-def test_what_is_rendered() -> None:
+def test_what_is_rendered():
     rendered = render_scene(draw_scene(0, 2, SMALL, tent()), SMALL)
     pixels = rendered.mask.sum()
     assert rendered.mask.shape == (16, 16)
@@ -59,7 +60,7 @@ def test_what_is_rendered() -> None:
         assert added.mean() > 0.01 * alone.observations[name].mean()
 
 
-def test_lights_cover_the_upper_hemisphere() -> None:
+def test_lights_cover_the_upper_hemisphere():
     lights = draw_lights(500, np.random.default_rng(0))
     np.testing.assert_allclose(np.linalg.norm(lights, axis=1), 1, atol=1e-5)
     assert (lights[:, 2] > MIN_LIGHT_Z).all()
@@ -68,5 +69,5 @@ def test_lights_cover_the_upper_hemisphere() -> None:
     assert np.histogram(lights[:, 2], bins=5, range=(0, 1))[0] == pytest.approx(100, abs=15)
     probes = np.random.default_rng(1).normal(size=(500, 3))
     probes[:, 2] = np.abs(probes[:, 2])
-    probes /= np.linalg.norm(probes, axis=1, keepdims=True)
+    probes = unit(probes)
     assert np.degrees(np.arccos((probes @ lights.T).max(axis=1))).max() < 12

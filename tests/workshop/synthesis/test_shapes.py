@@ -4,14 +4,15 @@ files give them.
 
 import time
 import zipfile
-from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
+from scenes import to_uint16, write_image
 from splinecli.errors import InputError
+from splinecli.maths.normals import unit
 from splinecli.workshop.synthesis import meshes
 from splinecli.workshop.synthesis.meshes import (
     REACH,
@@ -45,7 +46,7 @@ def points(count: int = 2000, seed: int = 0) -> Floats:
         meshes.capsule(0.4, 0.2),
     ],
 )
-def test_solids_are_true_distances(field: meshes.Field) -> None:
+def test_solids_are_true_distances(field):
     at = points()
     slope = np.linalg.norm(meshes.gradient(field, at), axis=1)
     # But on the creases of the box's inside and on axes, which few points are near, distance grows
@@ -57,7 +58,7 @@ def test_solids_are_true_distances(field: meshes.Field) -> None:
     assert np.abs(field(foot))[outside].max() < 2e-3
 
 
-def test_a_smooth_union_fills_the_seam_and_a_cut_takes_out() -> None:
+def test_a_smooth_union_fills_the_seam_and_a_cut_takes_out():
     first, second = points(seed=1)[:, 0], points(seed=2)[:, 0]
     union = meshes.smooth_union(first, second, 0.1)
     apart = np.abs(first - second) > 0.1
@@ -67,10 +68,10 @@ def test_a_smooth_union_fills_the_seam_and_a_cut_takes_out() -> None:
     # a quarter of the blend, where both are alike
     assert below.max() == pytest.approx(0.025, abs=1e-3)
     cut, apart = meshes.smooth_cut(first, second, 0.1), np.abs(first + second) > 0.1
-    np.testing.assert_allclose(cut[apart], np.maximum(first, -second)[apart])
+    assert_allclose(cut[apart], np.maximum(first, -second)[apart])
 
 
-def test_triangles_lie_on_the_zero_with_the_field_s_normals() -> None:
+def test_triangles_lie_on_the_zero_with_the_field_s_normals():
     mesh = meshes.triangulate(meshes.torus(0.6, 0.25), (1.0, 1.0, 0.5), 0.03)
     assert np.abs(meshes.torus(0.6, 0.25)(mesh.vertices)).max() < 2e-4
     ring = mesh.vertices * (1, 1, 0)
@@ -81,8 +82,8 @@ def test_triangles_lie_on_the_zero_with_the_field_s_normals() -> None:
     assert outward_volume(mesh) == pytest.approx(2 * np.pi**2 * 0.6 * 0.25**2, rel=0.01)
 
 
-def test_crumbs_and_the_empty_field_are_dropped() -> None:
-    def two_balls(at: Floats) -> Floats:
+def test_crumbs_and_the_empty_field_are_dropped():
+    def two_balls(at):
         large = np.linalg.norm(at, axis=1) - np.float32(0.5)
         small = np.linalg.norm(at - np.float32(0.8), axis=1) - np.float32(0.1)
         return np.minimum(large, small)
@@ -92,29 +93,27 @@ def test_crumbs_and_the_empty_field_are_dropped() -> None:
     assert meshes.triangulate(lambda at: np.ones(len(at), np.float32), (1.0, 1.0, 1.0), 0.1) is None
 
 
-def test_skipping_what_is_far_from_the_surface_changes_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_skipping_what_is_far_from_the_surface_changes_nothing(monkeypatch):
     noise = meshes.waves(np.random.default_rng(0), 1.0)
 
-    def lumps(at: Floats) -> Floats:
+    def lumps(at):
         return np.linalg.norm(at, axis=1) - np.float32(0.6) - np.float32(0.05) * noise(at)
 
     sparse = meshes.triangulate(lumps, (1.0, 1.0, 1.0), 0.05)
     monkeypatch.setattr(meshes, "COARSE", 1)
     dense = meshes.triangulate(lumps, (1.0, 1.0, 1.0), 0.05)
     assert len(sparse.faces) == len(dense.faces)
-    np.testing.assert_allclose(outward_volume(sparse), outward_volume(dense), rtol=1e-5)
+    assert_allclose(outward_volume(sparse), outward_volume(dense), rtol=1e-5)
 
 
 @pytest.mark.parametrize("kind", list(KINDS))
-def test_each_kind_is_sound_and_hollow(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_kind_is_sound_and_hollow(kind, monkeypatch):
     # A coarser field, for speed.
     monkeypatch.setattr("splinecli.workshop.synthesis.shapes.SPACING", 0.025)
     mesh = draw_shape_of_kind(kind, np.random.default_rng(5))
     assert mesh.vertices.dtype == mesh.vertex_normals.dtype == np.float32
     assert mesh.faces.min() == 0 and mesh.faces.max() == len(mesh.vertices) - 1
-    np.testing.assert_allclose(np.linalg.norm(mesh.vertex_normals, axis=1), 1, atol=1e-5)
+    assert_allclose(np.linalg.norm(mesh.vertex_normals, axis=1), 1, atol=1e-5)
     assert outward_volume(mesh) > 0
     reach = np.abs(mesh.vertices[:, :2]).max()
     # A relief goes beyond the frame, so that no pixel sees its edge.
@@ -144,41 +143,41 @@ HEIGHT_SLOPES = np.stack(
 
 
 @pytest.mark.parametrize("green_up", [True, False])
-def test_slopes_are_found_whichever_way_green_points(tmp_path: Path, green_up: bool) -> None:
+def test_slopes_are_found_whichever_way_green_points(tmp_path, green_up):
     normals = np.dstack((-HEIGHT_SLOPES, np.ones((SIDE, SIDE))))
     normals[..., 1] *= -1 if green_up else 1
-    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    normals = unit(normals)
     path = tmp_path / "waves.png"
-    cv2.imwrite(str(path), np.rint((normals + 1) / 2 * 65535).astype(np.uint16)[..., ::-1])
-    np.testing.assert_allclose(read_relief(path), HEIGHT_SLOPES, atol=1e-3)
+    write_image(path, to_uint16((normals + 1) / 2 * 65535)[..., ::-1])  # type: ignore[operator]
+    assert_allclose(read_relief(path), HEIGHT_SLOPES, atol=1e-3)
 
 
-def test_a_gray_image_is_no_relief(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "gray.png"), np.zeros((8, 8), np.uint8))
+def test_a_gray_image_is_no_relief(tmp_path):
+    write_image(tmp_path / "gray.png", np.zeros((8, 8), np.uint8))
     with pytest.raises(InputError, match="found a gray image, expected a normal map"):
         read_relief(tmp_path / "gray.png")
 
 
-def test_a_plate_gets_the_normals_of_the_height() -> None:
+def test_a_plate_gets_the_normals_of_the_height():
     relief = Relief(HEIGHT_SLOPES, np.eye(3, dtype=np.float32), period=0.5)
     places = np.random.default_rng(0).uniform(-1, 1, (500, 3)).astype(np.float32)
     places[:, 2] = 0
     up = np.tile(np.float32((0, 0, 1)), (500, 1))
     slope = 0.6 * np.cos(2 * np.pi * (places[:, 0] + places[:, 1]) / 0.5)
     expected = np.stack((-slope, -slope, np.ones(500)), axis=1)
-    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    expected = unit(expected)
     off = np.degrees(np.arccos(np.clip((relief.bend(up, places) * expected).sum(axis=1), -1, 1)))
     assert off.max() < 4.5  # half a texel of 64 along both axes
 
 
-def test_no_normal_turns_away_from_the_camera() -> None:
+def test_no_normal_turns_away_from_the_camera():
     rng = np.random.default_rng(1)
     normals = rng.normal(size=(4000, 3)).astype(np.float32)
     normals[:, 2] = np.abs(normals[:, 2])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit(normals)
     relief = draw_detail(6 * HEIGHT_SLOPES, 128, np.random.default_rng(3))
     bent = relief.bend(normals, rng.uniform(-1, 1, (4000, 3)).astype(np.float32))
-    np.testing.assert_allclose(np.linalg.norm(bent, axis=1), 1, atol=1e-5)
+    assert_allclose(np.linalg.norm(bent, axis=1), 1, atol=1e-5)
     assert (bent[:, 2] >= np.minimum(normals[:, 2], 0.1) - 1e-3).all()
     assert np.degrees(np.arccos(np.clip((bent * normals).sum(axis=1), -1, 1))).mean() > 3
 
@@ -199,9 +198,7 @@ def area(mesh: Mesh) -> float:
 
 
 @pytest.mark.parametrize("ending", ["ply", "obj", "stl", "stl_ascii", "off"])
-def test_a_ball_is_read_from_every_format_smooth_and_in_the_frame(
-    tmp_path: Path, ending: str
-) -> None:
+def test_a_ball_is_read_from_every_format_smooth_and_in_the_frame(tmp_path, ending):
     path = tmp_path / f"ball.{ending}"
     ball = trimesh.creation.icosphere(subdivisions=4, radius=17.0).apply_translation((5, -3, 40))
     ball.export(path, file_type=ending)
@@ -215,25 +212,25 @@ def test_a_ball_is_read_from_every_format_smooth_and_in_the_frame(
     assert np.linalg.norm(edges, axis=2).max() <= 0.03
 
 
-def test_the_wider_side_fits_and_the_shape_is_kept() -> None:
+def test_the_wider_side_fits_and_the_shape_is_kept():
     box = trimesh.creation.box((4.0, 1.0, 2.0))
     vertices = box.vertices.astype(np.float32) + np.float32(3)
     mesh = fit_to_frame(
         Mesh(vertices, box.faces.astype(np.int32), box.vertex_normals.astype(np.float32))
     )
     extent = np.ptp(mesh.vertices, axis=0)
-    np.testing.assert_allclose(extent, 2 * REACH * np.array((1, 0.25, 0.5)), rtol=1e-5)
-    np.testing.assert_allclose(mesh.vertices.min(axis=0), -mesh.vertices.max(axis=0), atol=1e-6)
+    assert_allclose(extent, 2 * REACH * np.array((1, 0.25, 0.5)), rtol=1e-5)
+    assert_allclose(mesh.vertices.min(axis=0), -mesh.vertices.max(axis=0), atol=1e-6)
 
 
-def test_a_ball_inside_out_is_turned(tmp_path: Path) -> None:
+def test_a_ball_inside_out_is_turned(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=3)
     ball.invert()
     ball.export(tmp_path / "inverted.ply")
     assert outward_volume(read_mesh(tmp_path / "inverted.ply")) > 0
 
 
-def test_blank_lines_are_skipped_in_a_time_that_grows_with_their_number(tmp_path: Path) -> None:
+def test_blank_lines_are_skipped_in_a_time_that_grows_with_their_number(tmp_path):
     (tmp_path / "blank.obj").write_text("\n" * 2_000_000)
     started = time.process_time()
     with pytest.raises(InputError):
@@ -241,7 +238,7 @@ def test_blank_lines_are_skipped_in_a_time_that_grows_with_their_number(tmp_path
     assert time.process_time() - started < 3  # the square took an hour
 
 
-def test_splitting_edges_changes_neither_surface_nor_shading() -> None:
+def test_splitting_edges_changes_neither_surface_nor_shading():
     box = trimesh.creation.box((1.0, 1.0, 1.0))
     mesh = Mesh(
         box.vertices.astype(np.float32),
@@ -252,13 +249,13 @@ def test_splitting_edges_changes_neither_surface_nor_shading() -> None:
     assert len(fine.faces) > 600
     assert area(fine) == pytest.approx(area(mesh), rel=1e-6)
     assert outward_volume(fine) == pytest.approx(outward_volume(mesh), rel=1e-6)
-    np.testing.assert_allclose(np.linalg.norm(fine.vertex_normals, axis=1), 1, atol=1e-6)
+    assert_allclose(np.linalg.norm(fine.vertex_normals, axis=1), 1, atol=1e-6)
     # What is fine enough already stays as it is, and the number of faces has its limit.
     assert len(split_long_edges(mesh, longest=2.0).faces) == len(mesh.faces)
     assert len(split_long_edges(mesh, longest=0.01, most_faces=5000).faces) <= 5000
 
 
-def test_what_is_no_mesh_is_refused_with_the_reason(tmp_path: Path) -> None:
+def test_what_is_no_mesh_is_refused_with_the_reason(tmp_path):
     for name, text, reason in (
         ("broken.ply", "ply, but not really", r"broken\.ply: not a mesh that can be read"),
         ("notes.txt", "nothing but words", "not a mesh that can be read"),
@@ -276,7 +273,7 @@ def test_what_is_no_mesh_is_refused_with_the_reason(tmp_path: Path) -> None:
             read_mesh(tmp_path / name)
 
 
-def test_archives_and_files_of_other_formats_are_refused(tmp_path: Path) -> None:
+def test_archives_and_files_of_other_formats_are_refused(tmp_path):
     ball = trimesh.creation.icosphere()
     for ending in ("zip", "ply"):
         with zipfile.ZipFile(tmp_path / f"archive.{ending}", "w", zipfile.ZIP_DEFLATED) as archive:
@@ -290,7 +287,7 @@ def test_archives_and_files_of_other_formats_are_refused(tmp_path: Path) -> None
         read_mesh(tmp_path / "ball.glb")
 
 
-def test_large_meshes_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_meshes_are_refused(tmp_path, monkeypatch):
     (tmp_path / "long.obj").write_bytes(b"v 0 0 0\n" + b" " * 32_000_000)
     with pytest.raises(InputError, match=r"long\.obj: found a longer file than 32 MB"):
         read_mesh(tmp_path / "long.obj")

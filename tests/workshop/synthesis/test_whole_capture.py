@@ -8,7 +8,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
+from distributions import seeded
 from scenes import spiral_lights
 from splinecli.workshop.synthesis.whole_capture import (
     Optics,
@@ -29,10 +31,10 @@ def disc(size: int = 40) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_object_stays(seed: int) -> None:
+def test_the_object_stays(seed):
     mask = disc()
-    maps = torch.rand(9, 40, 40, generator=torch.Generator().manual_seed(9)) + 0.2
-    found, shown = add_background(maps, mask, LIGHTS, torch.Generator().manual_seed(seed))
+    maps = torch.rand(9, 40, 40, generator=seeded(9)) + 0.2
+    found, shown = add_background(maps, mask, LIGHTS, seeded(seed))
     # The object is where the maps have its values; all its pixels are shown, and others too.
     held = (found == maps[:, 20, 20, None, None]).all(dim=0).nonzero()
     assert len(held) == 1
@@ -47,7 +49,7 @@ def test_the_object_stays(seed: int) -> None:
     assert bool((length == 0).all()) or torch.allclose(length, torch.ones_like(length))
 
 
-def test_shadows_fall_away_from_the_light() -> None:
+def test_shadows_fall_away_from_the_light():
     """A light at the right, 45 degrees up, moves the shadow left by the distance; one above moves
     it down.
     """
@@ -61,25 +63,23 @@ SIZE = 48
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_piece(seed: int) -> None:
-    normals, radiance, mask = draw_engraved(SIZE, LIGHTS, torch.Generator().manual_seed(seed))
+def test_a_piece(seed):
+    normals, radiance, mask = draw_engraved(SIZE, LIGHTS, seeded(seed))
     assert mask.shape == (SIZE, SIZE)
     pixels = int(mask.sum())
     assert normals.shape == (pixels, 3) and radiance.shape == (pixels, 6)
-    torch.testing.assert_close(normals.norm(dim=1), torch.ones(pixels))
+    assert_close(normals.norm(dim=1), torch.ones(pixels))
     assert (normals[:, 2] > 0).all()
     assert torch.isfinite(radiance).all() and (radiance >= 0).all()
     assert (radiance[normals @ LIGHTS.T <= 0] == 0).all()
-    again = draw_engraved(SIZE, LIGHTS, torch.Generator().manual_seed(seed))
+    again = draw_engraved(SIZE, LIGHTS, seeded(seed))
     assert torch.equal(again[0], normals) and torch.equal(again[1], radiance)
 
 
-def test_round_pieces_turn_away_at_their_rim() -> None:
+def test_round_pieces_turn_away_at_their_rim():
     """On average, the normals point away from the middle, and more so further out."""
     for seed in range(6):
-        normals, _, mask = draw_engraved(
-            SIZE, LIGHTS, torch.Generator().manual_seed(seed), round_share=1.0
-        )
+        normals, _, mask = draw_engraved(SIZE, LIGHTS, seeded(seed), round_share=1.0)
         assert 0.25 < mask.float().mean() < 0.8 and not mask[0].any()
         rows, columns = mask.nonzero().float().T
         outwards = torch.stack((columns - columns.mean(), rows.mean() - rows), dim=1)
@@ -111,7 +111,7 @@ def spread(kernel: torch.Tensor) -> float:
 
 
 @pytest.mark.parametrize("sigma", [0.6, 0.9, 1.2])
-def test_kernels_have_the_width_that_they_state(sigma: float) -> None:
+def test_kernels_have_the_width_that_they_state(sigma):
     assert spread(gaussian_kernel(sigma)) == pytest.approx(sigma, rel=0.05)
     # The mean over a pixel adds the variance of its own width, a twelfth.
     assert spread(disc_kernel(sigma)) == pytest.approx(np.sqrt(sigma**2 + 1 / 12), rel=0.08)
@@ -119,24 +119,24 @@ def test_kernels_have_the_width_that_they_state(sigma: float) -> None:
         assert float(kernel.sum()) == pytest.approx(1)
 
 
-def test_a_lens_spreads_a_point_into_its_kernel() -> None:
+def test_a_lens_spreads_a_point_into_its_kernel():
     image = torch.zeros(1, 11, 11)
     image[0, 5, 5] = 1
     kernel = gaussian_kernel(0.7)
     colours = camera(kernel.expand(3, -1, -1)).through_lens(image)
     reach = len(kernel) // 2
-    torch.testing.assert_close(colours[1, 0, 5 - reach : 6 + reach, 5 - reach : 6 + reach], kernel)
+    assert_close(colours[1, 0, 5 - reach : 6 + reach, 5 - reach : 6 + reach], kernel)
     assert float(colours[2].sum()) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("code", [cv2.COLOR_BayerRGGB2RGB, cv2.COLOR_BayerRGGB2RGB_EA])
-def test_a_bayer_pattern_keeps_ramps_and_blurs_points(code: int) -> None:
+def test_a_bayer_pattern_keeps_ramps_and_blurs_points(code):
     """Linear interpolation is exact on a ramp, whichever colours the ramp has. A point spreads."""
     ramp = (0.1 + 0.05 * torch.arange(12.0)).expand(1, 12, 12)
     colours = torch.stack((0.5 * ramp, ramp, 0.8 * ramp))
     developed = camera(demosaic=code).develop(colours)
     inside = (0, slice(2, -2), slice(2, -2))
-    torch.testing.assert_close(developed[inside], 0.825 * ramp[inside], atol=2e-4, rtol=0)
+    assert_close(developed[inside], 0.825 * ramp[inside], atol=2e-4, rtol=0)
     point = torch.zeros(3, 1, 12, 12)
     point[:, 0, 6, 6] = 1  # a red cell: green and blue miss it
     seen = camera(demosaic=code).develop(point)
@@ -144,24 +144,24 @@ def test_a_bayer_pattern_keeps_ramps_and_blurs_points(code: int) -> None:
     assert float(seen[0, 6, 7]) == pytest.approx(0.125, abs=1e-3)
 
 
-def test_sharpening_raises_contrast_and_jpeg_keeps_flat_areas() -> None:
+def test_sharpening_raises_contrast_and_jpeg_keeps_flat_areas():
     edge = torch.cat((torch.full((1, 16, 8), 0.2), torch.full((1, 16, 8), 0.6)), dim=2)
     sharp = camera(sharpening=0.8).develop(edge.expand(3, 1, 16, 16))
     assert float(sharp[0, 8, 7]) < 0.19 and float(sharp[0, 8, 8]) > 0.61
-    torch.testing.assert_close(sharp[0, :, :3], edge[0, :, :3])
+    assert_close(sharp[0, :, :3], edge[0, :, :3])
     flat = torch.full((1, 16, 16), 0.3)
-    rough = torch.rand(1, 16, 16, generator=torch.Generator().manual_seed(0))
+    rough = torch.rand(1, 16, 16, generator=seeded(0))
     coarse, fine = (camera(quality=quality).compress(rough) for quality in (20, 98))
     assert (coarse - rough).abs().mean() > 2 * (fine - rough).abs().mean()
-    torch.testing.assert_close(camera(quality=90).compress(flat), flat, atol=3e-3, rtol=0)
+    assert_close(camera(quality=90).compress(flat), flat, atol=3e-3, rtol=0)
 
 
-def test_light_that_scatters_stays_in_the_object() -> None:
+def test_light_that_scatters_stays_in_the_object():
     mask = torch.zeros(20, 20, dtype=torch.bool)
     mask[4:16, 4:16] = True
-    radiance = torch.rand(3, 20, 20, generator=torch.Generator().manual_seed(0)) * mask
-    spread_out = scatter(radiance, mask, torch.Generator().manual_seed(1))
+    radiance = torch.rand(3, 20, 20, generator=seeded(0)) * mask
+    spread_out = scatter(radiance, mask, seeded(1))
     assert not spread_out[:, ~mask].any()
     assert spread_out[:, mask].std() < 0.9 * radiance[:, mask].std()
-    even = scatter(mask.float()[None], mask, torch.Generator().manual_seed(1))
-    torch.testing.assert_close(even[0], mask.float())
+    even = scatter(mask.float()[None], mask, seeded(1))
+    assert_close(even[0], mask.float())

@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -24,7 +23,7 @@ from splinecli.workshop.training.config import (
 
 
 @pytest.mark.parametrize("name", list(PRESETS))
-def test_round_trip_through_json(name: str) -> None:
+def test_round_trip_through_json(name):
     config = preset(name, seed=7, minutes=0.5)
     assert TrainingConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
@@ -56,12 +55,12 @@ def test_round_trip_through_json(name: str) -> None:
         ),
     ],
 )
-def test_refused(values: dict[str, Any], message: str) -> None:
+def test_refused(values, message):
     with pytest.raises(ModelError, match=message):
         TrainingConfig.from_dict(values)
 
 
-def test_presets_by_name() -> None:
+def test_presets_by_name():
     # The paper's section 4; its code where that is silent (docs/train.md).
     paper = preset("paper").to_dict()
     published = {
@@ -89,7 +88,7 @@ def write(path: Path, text: str) -> Path:
 
 
 @pytest.mark.parametrize("asked", [None, "compact"])
-def test_a_toml_file_over_a_preset(tmp_path: Path, asked: str | None) -> None:
+def test_a_toml_file_over_a_preset(tmp_path, asked):
     """A preset that is asked for by name comes before the file's."""
     text = (
         'preset = "paper"\nbatch_size = 64\n[pixels]\nwall_share = 0.3\n[network]\nmap_size = 16\n'
@@ -100,7 +99,7 @@ def test_a_toml_file_over_a_preset(tmp_path: Path, asked: str | None) -> None:
     assert configure(asked, write(tmp_path / "a.toml", text)) == expected
 
 
-def test_sources_are_replaced_as_a_whole(tmp_path: Path) -> None:
+def test_sources_are_replaced_as_a_whole(tmp_path):
     file = write(tmp_path / "a.toml", '[sources]\n"/data/a" = 2.0\n"/data/b" = 1.0\n')
     assert configure(None, file).sources == {"/data/a": 2.0, "/data/b": 1.0}
     assert configure(None, file, [{"sources": {"/data/c": 1.0}}]).sources == {"/data/c": 1.0}
@@ -112,14 +111,14 @@ def test_sources_are_replaced_as_a_whole(tmp_path: Path) -> None:
     ("text", "message"),
     [("batch_size = 7", "is 7; expected a multiple of shards = 2"), ("steps = ", "is not TOML")],
 )
-def test_what_is_wrong_in_a_file_names_the_file(tmp_path: Path, text: str, message: str) -> None:
+def test_what_is_wrong_in_a_file_names_the_file(tmp_path, text, message):
     file = write(tmp_path / "a.toml", text)
     with pytest.raises(ModelError, match=message) as caught:
         configure(None, file, [{"seed": 1}])
     assert caught.value.path == file
 
 
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(ModelError, match="found a folder, expected a text file"):
         read_config_file(tmp_path)
     for name, content, message in (
@@ -146,17 +145,17 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         ("seed=", {"seed": ""}),
     ],
 )
-def test_parameters(text: str, expected: dict[str, Any]) -> None:
+def test_parameters(text, expected):
     assert parse_parameter(text) == expected
 
 
 @pytest.mark.parametrize("text", ["seed", "=3", "a..b=1"])
-def test_bad_parameters(text: str) -> None:
+def test_bad_parameters(text):
     with pytest.raises(UsageError, match=f"{text!r}; expected NAME=VALUE such as"):
         parse_parameter(text)
 
 
-def test_a_run_on_other_sources_is_refused(tmp_path: Path) -> None:
+def test_a_run_on_other_sources_is_refused(tmp_path):
     other = configure(changes=[{"sources": {"/data/set": 1.0}}], base=TrainingConfig())
     with pytest.raises(
         ModelError, match=r"the run was started with sources\./data/set = None, not 1\.0"
@@ -165,7 +164,7 @@ def test_a_run_on_other_sources_is_refused(tmp_path: Path) -> None:
     assert caught.value.path == tmp_path
 
 
-def test_a_setting_that_is_not_given_stays_as_it_was() -> None:
+def test_a_setting_that_is_not_given_stays_as_it_was():
     started = preset("compact", seed=5, batch_size=32)
     assert (
         configure(base=started) == configure(changes=[{"batch_size": 32}], base=started) == started
@@ -174,7 +173,7 @@ def test_a_setting_that_is_not_given_stays_as_it_was() -> None:
     assert configure("compact", changes=[{"seed": 5}], base=started) == preset("compact", seed=5)
 
 
-def test_length_and_rate_of_a_run_may_change(tmp_path: Path) -> None:
+def test_length_and_rate_of_a_run_may_change(tmp_path):
     file = write(tmp_path / "a.toml", "steps = 12\nlearning_rate = 1e-4")
     started = preset("compact", seed=5)
     asked = configure(None, file, [{"minutes": 3.0}], base=started)
@@ -182,9 +181,7 @@ def test_length_and_rate_of_a_run_may_change(tmp_path: Path) -> None:
     check_resumable(started, asked, tmp_path)
 
 
-def test_the_home_folder_is_expanded_in_every_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_home_folder_is_expanded_in_every_path(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     config = configure(changes=[{"sources": {"~/set": 1.0}}, {"start_from": "~/mine.safetensors"}])
     assert config.sources == {str(tmp_path / "set"): 1.0}
@@ -195,11 +192,11 @@ def test_the_home_folder_is_expanded_in_every_path(
     ("text", "expected"),
     [("10", (10, 10, 10)), ("4-96", (4, 96, 10)), ("3-8", (3, 8, 8)), ("12-40", (12, 40, 12))],
 )
-def test_light_counts(text: str, expected: tuple[int, int, int]) -> None:
+def test_light_counts(text, expected):
     assert tuple(parse_light_counts(text).values()) == expected
 
 
-def test_sources_of_the_command_line() -> None:
+def test_sources_of_the_command_line():
     sets = [Path("a"), Path("b")]
     assert parse_sources([], None) == {GENERATOR: 1.0}
     assert parse_sources(sets, None) == {"a": 1.0, "b": 1.0}
@@ -207,7 +204,7 @@ def test_sources_of_the_command_line() -> None:
     assert parse_sources([], 0.0) == {}
 
 
-def test_removed_settings_of_earlier_versions(tmp_path: Path) -> None:
+def test_removed_settings_of_earlier_versions(tmp_path):
     unused = write(
         tmp_path / "old.toml", "[pixels]\nmeasured_share = 0.0\nmeasured_materials = ''\n"
     )

@@ -6,14 +6,13 @@ import socket
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import torch
+from torch.testing import assert_close
 
 from splinecli.estimate.networks.weights import load_weights
-from splinecli.workshop.training import METRICS
-from splinecli.workshop.training.config import TrainingConfig
-from splinecli.workshop.training.loop import WEIGHTS, Trainer
+from splinecli.workshop.training import METRICS, WEIGHTS
+from splinecli.workshop.training.loop import Trainer
 from splinecli.workshop.training.run_files import read_metrics
 
 CPU = torch.device("cpu")
@@ -39,9 +38,9 @@ WORKER = """
 import json, os, sys
 from pathlib import Path
 import torch
-from splinecli.training import loop, tasks
-from splinecli.training.config import TrainingConfig
-from splinecli.training.loop import join_workers, leave_workers
+from splinecli.workshop.training import loop, tasks
+from splinecli.workshop.training.config import TrainingConfig
+from splinecli.workshop.training.loop import join_workers, leave_workers
 tasks.VALIDATION_PIXELS = 16
 workers, device = join_workers(torch.device("cpu"))
 assert workers.agree(7.0 + workers.rank, device) == 7.0
@@ -55,7 +54,7 @@ os._exit(0)
 """
 
 
-def test_two_processes_compute_what_one_does(tiny: TrainingConfig, tmp_path: Path) -> None:
+def test_two_processes_compute_what_one_does(tiny, tmp_path):
     config = replace(tiny, symmetric_weight=0.02, asymmetric_weight=1e-4, ne_net_updates=2)
     configs = {"joint": config, "alternating": replace(config, updates="alternating")}
     text = json.dumps({name: values.to_dict() for name, values in configs.items()})
@@ -82,11 +81,11 @@ def test_two_processes_compute_what_one_does(tiny: TrainingConfig, tmp_path: Pat
         for rank in range(2):
             losses, state = torch.load(tmp_path / f"{name} {rank}.pt", weights_only=True)
             # Sums over the pixels are taken in another order: float32's rounding.
-            torch.testing.assert_close(losses, expected, rtol=1e-5, atol=0, equal_nan=True)
+            assert_close(losses, expected, rtol=1e-5, atol=0, equal_nan=True)
             assert state.keys() == weights.keys()
             states.append(state)
             # Adam divides by the gradient's size, so where that is next to nothing rounding shows.
-            torch.testing.assert_close(state, dict(weights), rtol=1e-3, atol=1e-5)
+            assert_close(state, dict(weights), rtol=1e-3, atol=1e-5)
         assert all(torch.equal(states[0][key], states[1][key]) for key in weights)
         # Of two, the leader alone writes.
         assert (tmp_path / name / "config.json").exists()
@@ -95,8 +94,8 @@ def test_two_processes_compute_what_one_does(tiny: TrainingConfig, tmp_path: Pat
 FAILING = """
 import os, signal
 from splinecli.__main__ import run
-from splinecli.training import loop, tasks
-from splinecli.training.run_files import RunLog
+from splinecli.workshop.training import loop, tasks
+from splinecli.workshop.training.run_files import RunLog
 loop.CHECKPOINT_SECONDS, loop.REPORT_STEPS, tasks.VALIDATION_PIXELS = 0.05, 5, 16
 RunLog.draw = lambda self, maps: None
 step = loop.Trainer.step
@@ -111,7 +110,7 @@ run()
 """
 
 
-def test_a_run_outlives_one_of_its_processes(tmp_path: Path) -> None:
+def test_a_run_outlives_one_of_its_processes(tmp_path):
     # On the processor, one process of two is killed after the first checkpoint; torchrun starts
     # both again.
     (tmp_path / "worker.py").write_text(FAILING)

@@ -3,23 +3,25 @@ and it says when it cannot go on.
 """
 
 import itertools
-import json
 import math
 from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
 import torch
+from torch.testing import assert_close
 
+from distributions import seeded
+from scenes import read_json
 from splinecli.errors import ModelError
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import load_weights
 from splinecli.workshop.save_weights import save_weights
 from splinecli.workshop.synthesis.batches import PixelBatch
 from splinecli.workshop.synthesis.pixels import PixelGenerator
-from splinecli.workshop.training import METRICS, loop
+from splinecli.workshop.training import CHECKPOINT, METRICS, WEIGHTS, loop
 from splinecli.workshop.training.config import GENERATOR, TrainingConfig, preset
-from splinecli.workshop.training.loop import CHECKPOINT, WEIGHTS, Trainer, learning_rate
+from splinecli.workshop.training.loop import Trainer, learning_rate
 from splinecli.workshop.training.objective import compute_losses
 from splinecli.workshop.training.run_files import Metrics, read_checkpoint_config, read_metrics
 from splinecli.workshop.training.tasks import PixelTask
@@ -34,7 +36,7 @@ class OneBatch(PixelGenerator):
     """Draws the same batch again and again."""
 
     def __init__(self, config: TrainingConfig) -> None:
-        super().__init__(config.pixels, torch.Generator().manual_seed(config.seed))
+        super().__init__(config.pixels, seeded(config.seed))
         self.batch = PixelGenerator.draw(self, config.batch_size)
 
     def draw(self, pixels: int) -> PixelBatch:
@@ -55,11 +57,11 @@ COSINE = TrainingConfig(learning_rate=1.5e-3, warmup_steps=300)
         (preset("paper"), 0, 0.9, 1e-5),
     ],
 )
-def test_schedules(config: TrainingConfig, step: int, progress: float, expected: float) -> None:
+def test_schedules(config, step, progress, expected):
     assert learning_rate(config, step, progress) == pytest.approx(expected)
 
 
-def test_normals_of_one_batch_are_learnt_by_heart(tiny: TrainingConfig, tmp_path: Path) -> None:
+def test_normals_of_one_batch_are_learnt_by_heart(tiny, tmp_path):
     # At 1e-2 all units of so small a network may fall silent.
     config = replace(tiny, steps=300, seed=6, learning_rate=3e-3, turn_jitter_deg=0.0, shards=1)
     trainer = Trainer(config, tmp_path, CPU)
@@ -103,12 +105,10 @@ def test_a_run_taken_up_goes_on_as_if_never_stopped(tiny, tmp_path, make_set, up
     assert losses(second, 3) == pytest.approx(expected[3:], rel=1e-6)
     for network in ("network", "average"):
         for name, tensor in getattr(whole, network).state_dict().items():
-            torch.testing.assert_close(
-                getattr(second, network).state_dict()[name], tensor, rtol=1e-5, atol=1e-7
-            )
+            assert_close(getattr(second, network).state_dict()[name], tensor, rtol=1e-5, atol=1e-7)
 
 
-def test_a_run_begins_with_the_weights_it_is_given(tiny: TrainingConfig, tmp_path: Path) -> None:
+def test_a_run_begins_with_the_weights_it_is_given(tiny, tmp_path):
     first = Trainer(tiny, tmp_path / "first", CPU)
     first.run()
     config = replace(tiny, start_from=str(tmp_path / "first" / WEIGHTS), seed=9)
@@ -123,9 +123,7 @@ def test_a_run_begins_with_the_weights_it_is_given(tiny: TrainingConfig, tmp_pat
     assert all(torch.equal(again.network.state_dict()[name], trained[name]) for name in trained)
 
 
-def test_a_network_learns_to_see_the_capture_from_weights_that_do_not(
-    tiny: TrainingConfig, tmp_path: Path
-) -> None:
+def test_a_network_learns_to_see_the_capture_from_weights_that_do_not(tiny, tmp_path):
     alone = replace(tiny, network=replace(tiny.network, map_size=16, set_width=16, set_layers=1))
     first = Trainer(alone, tmp_path / "first", CPU)
     first.run()
@@ -138,14 +136,14 @@ def test_a_network_learns_to_see_the_capture_from_weights_that_do_not(
     second = Trainer(seeing, tmp_path / "second", CPU)
     second.run()
     contexts = load_weights(tmp_path / "second" / WEIGHTS).network.set_branch.contexts
-    assert contexts is not None and contexts[0].join[2].weight.any()
+    assert contexts is not None and contexts[0].join[2].weight.any()  # type: ignore[index]
     with pytest.raises(ModelError, match="with sees_capture = True, the run's has False"):
         Trainer(
             replace(alone, start_from=str(tmp_path / "second" / WEIGHTS)), tmp_path / "third", CPU
         )
 
 
-def test_only_the_error_head_learns_of_errors(tiny: TrainingConfig, tmp_path: Path) -> None:
+def test_only_the_error_head_learns_of_errors(tiny, tmp_path):
     Trainer(tiny, tmp_path / "first", CPU).run()
     config = replace(
         tiny,
@@ -184,9 +182,7 @@ def test_only_the_error_head_learns_of_errors(tiny: TrainingConfig, tmp_path: Pa
             replace(tiny, **settings)
 
 
-def test_a_run_writes_its_files(
-    tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_writes_its_files(tiny, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "REPORT_STEPS", 4)
     seen: list[tuple[float, Metrics]] = []
     trainer = Trainer(replace(tiny, steps=10), tmp_path, CPU)
@@ -215,15 +211,10 @@ def test_a_run_writes_its_files(
     again = trainer.task.validation_deg(loaded, bfloat16=False)
     assert again == pytest.approx(last.validation_deg, abs=0.05)  # float16
     assert rows[-1].loss == pytest.approx(last.loss, rel=1e-5)
-    assert (
-        TrainingConfig.from_dict(json.loads((tmp_path / "config.json").read_text()))
-        == trainer.config
-    )
+    assert TrainingConfig.from_dict(read_json(tmp_path / "config.json")) == trainer.config
 
 
-def test_minutes_bound_a_run(
-    tiny: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_minutes_bound_a_run(tiny, tmp_path, monkeypatch):
     # A clock that moves by 0.05 s each time it is read: the machine's own speed is not what is
     # tested.
     readings = itertools.count()
@@ -275,7 +266,7 @@ def test_what_is_not_finite_ends_the_run_before_it_does_harm(tiny, tmp_path, wha
     assert math.isfinite(losses(Trainer(trainer.config, tmp_path, CPU, resume=True), 1)[0])
 
 
-def test_validation_never_disturbs_training(tiny: TrainingConfig, tmp_path: Path) -> None:
+def test_validation_never_disturbs_training(tiny, tmp_path):
     plain, checked = Trainer(tiny, tmp_path / "a", CPU), Trainer(tiny, tmp_path / "b", CPU)
     expected = losses(plain, 3)
     found = []
@@ -285,7 +276,7 @@ def test_validation_never_disturbs_training(tiny: TrainingConfig, tmp_path: Path
     assert found == expected
 
 
-def test_the_average_follows_the_weights(tiny: TrainingConfig, tmp_path: Path) -> None:
+def test_the_average_follows_the_weights(tiny, tmp_path):
     trainer = Trainer(replace(tiny, average_decay=0.3), tmp_path, CPU)
     expected = [parameter.detach().clone() for parameter in trainer.network.parameters()]
     for step in range(4):
@@ -297,12 +288,12 @@ def test_the_average_follows_the_weights(tiny: TrainingConfig, tmp_path: Path) -
         ]
     assert math.isclose(decay, 4 / 13) or decay == 0.3
     for average, wanted in zip(trainer.average.parameters(), expected, strict=True):
-        torch.testing.assert_close(average, wanted)
+        assert_close(average, wanted)
 
 
-def test_validation_is_the_mean_angle_to_the_truth(tiny: TrainingConfig) -> None:
+def test_validation_is_the_mean_angle_to_the_truth(tiny):
     network, task = SplineNet(tiny.network).train(), PixelTask(tiny, range(1), CPU)
-    batch = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(3)).draw(40)
+    batch = PixelGenerator(tiny.pixels, seeded(3)).draw(40)
     task.validation = [batch]
     found = task.validation_deg(network, bfloat16=False)
     with torch.no_grad():
@@ -319,9 +310,7 @@ def trainer(tiny: TrainingConfig, tmp_path: Path) -> Trainer:
     return made
 
 
-def test_a_checkpoint_of_another_version_or_kind_is_refused(
-    trainer: Trainer, tmp_path: Path
-) -> None:
+def test_a_checkpoint_of_another_version_or_kind_is_refused(trainer, tmp_path):
     path = tmp_path / CHECKPOINT
     whole = path.read_bytes()
     save_weights(trainer.network, path)

@@ -2,20 +2,21 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from scipy.ndimage import map_coordinates
 from torch import Tensor, nn
+from torch.testing import assert_close
 
+from distributions import seeded
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.maths.observation_map import cell_directions, sparse_map
 from splinecli.workshop.synthesis.batches import PixelBatch
 from splinecli.workshop.synthesis.pixels import PixelGenerator
-from splinecli.workshop.training.config import Norm, TrainingConfig, preset
+from splinecli.workshop.training.config import TrainingConfig, preset
 from splinecli.workshop.training.loop import Trainer
 from splinecli.workshop.training.objective import (
     AXIS_LENGTH,
@@ -40,19 +41,19 @@ def at(zenith_deg: float, azimuth_deg: float = 0.0) -> Tensor:
 
 
 def random_maps(*shape: int, seed: int = 0) -> Tensor:
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return torch.rand(*shape, generator=seeded(seed), dtype=torch.float64)
 
 
 # A sine of 1e-6 stands in for zero, so that the gradient is bounded: 6e-5 degrees.
 @pytest.mark.parametrize("degrees", [0.0, 0.01, 10.0, 90.0, 179.0, 180.0])
-def test_angle(degrees: float) -> None:
+def test_angle(degrees):
     assert math.degrees(angles(at(degrees), at(0)).item()) == pytest.approx(degrees, abs=6e-5)
 
 
 @pytest.mark.parametrize(
     ("norm", "expected"), [("mean", (0.4 + 0.3) / 2), ("sum", (1.6 + 0.6) / 2)]
 )
-def test_map_loss_is_over_the_known_cells_of_each_pixel(norm: Norm, expected: float) -> None:
+def test_map_loss_is_over_the_known_cells_of_each_pixel(norm, expected):
     known = torch.zeros(2, 1, 4, 4, dtype=torch.float64)
     known[0, ..., 1:3, 1:3] = 1
     known[1, ..., 0, :2] = 1
@@ -67,7 +68,7 @@ def test_map_loss_is_over_the_known_cells_of_each_pixel(norm: Norm, expected: fl
 
 
 @pytest.mark.parametrize("azimuth_deg", [17, 90, 211])
-def test_mirror_against_scipy(azimuth_deg: int) -> None:
+def test_mirror_against_scipy(azimuth_deg):
     size = 16
     maps = random_maps(1, 1, size, size, seed=azimuth_deg)
     x, y = np.meshgrid(*[(np.arange(size) + 0.5) * 2 / size - 1] * 2)
@@ -83,7 +84,7 @@ def test_mirror_against_scipy(azimuth_deg: int) -> None:
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-9, AXIS_LENGTH / 2, AXIS_LENGTH, 1.0])
-def test_gradients_in_the_normal_are_finite(length: float) -> None:
+def test_gradients_in_the_normal_are_finite(length):
     normal = torch.tensor(
         [[length, 0.0, math.sqrt(1 - length**2)]], dtype=torch.float64, requires_grad=True
     )
@@ -118,9 +119,7 @@ def four_cells(**cells: float) -> Tensor:
         (four_cells(r0c0=0.9), 2 * four_cells(r3c0=0.0), 0.0, 0.0, 0.1 + 2 * 0.1),
     ],
 )
-def test_asymmetries_by_hand(
-    maps: Tensor, filled: Tensor | float, fine: float, coarse: float, loss: float
-) -> None:
+def test_asymmetries_by_hand(maps, filled, fine, coarse, loss):
     found = asymmetries(maps, at(30, 0), torch.ones_like(maps) * filled)
     assert [value.item() for value in found] == pytest.approx([fine, coarse], abs=1e-12)
     assert asymmetric_loss(*found, eta=0.1, lambda_c=2.0).item() == pytest.approx(loss)
@@ -137,7 +136,7 @@ def network() -> SplineNet:
 
 @pytest.fixture
 def batch(tiny: TrainingConfig) -> PixelBatch:
-    return PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0)).draw(12)
+    return PixelGenerator(tiny.pixels, seeded(0)).draw(12)
 
 
 def moved(module: nn.Module) -> bool:
@@ -145,9 +144,7 @@ def moved(module: nn.Module) -> bool:
     return any(p.grad is not None and bool(p.grad.any()) for p in module.parameters())
 
 
-def test_a_step_for_one_network_leaves_the_other_bitwise_alone(
-    tiny: TrainingConfig, tmp_path: Path
-) -> None:
+def test_a_step_for_one_network_leaves_the_other_bitwise_alone(tiny, tmp_path):
     config = replace(
         tiny,
         updates="alternating",
@@ -159,7 +156,7 @@ def test_a_step_for_one_network_leaves_the_other_bitwise_alone(
     )
     trainer = Trainer(config, tmp_path, CPU)
 
-    def state(name: str) -> list[Tensor]:
+    def state(name):
         return [p.detach().clone() for p in getattr(trainer.network, name).parameters()]
 
     # Momentum of earlier steps and weight decay must not move what is fixed, either.
@@ -223,7 +220,7 @@ def test_the_total_is_the_weighted_sum_of_its_terms(
     assert found.angle.item() == pytest.approx(angle.item(), abs=1e-4)
     terms = (found.on_map, found.masked, found.symmetric, found.asymmetric)
     expected = ((on_map / cells).mean(), (masked / seen).mean(), symmetric, asymmetric)
-    torch.testing.assert_close(terms, expected, rtol=1e-5, atol=0)
+    assert_close(terms, expected, rtol=1e-5, atol=0)
     total = 0.7 * found.angle + 0.02 * symmetric + 1e-3 * asymmetric
     if part != "ne_net":
         total += 0.5 * (on_map if li_net_norm == "sum" else on_map / cells).mean()
@@ -231,7 +228,7 @@ def test_the_total_is_the_weighted_sum_of_its_terms(
     assert found.total.item() == pytest.approx(total.item(), rel=1e-5)
 
 
-def test_a_degree_counts_more_on_a_capture_that_is_nearly_right() -> None:
+def test_a_degree_counts_more_on_a_capture_that_is_nearly_right():
     errors = torch.tensor([math.radians(1.0), math.radians(20.0)], requires_grad=True)
     (gradient,) = torch.autograd.grad(balanced(errors), errors)
     assert (gradient[0] / gradient[1]).item() == pytest.approx(math.sqrt(22.5 / 3.5))
@@ -243,15 +240,15 @@ def test_a_degree_counts_more_on_a_capture_that_is_nearly_right() -> None:
 
 
 @pytest.mark.parametrize("mirror", [False, True])
-def test_truth_agrees_with_what_the_network_sees(tiny: TrainingConfig, mirror: bool) -> None:
+def test_truth_agrees_with_what_the_network_sees(tiny, mirror):
     # Without a camera's faults, the true dense map at a light in a cell's centre is the sparse map
     # there.
     network = SplineNet(tiny.network)
-    batch = PixelGenerator(tiny.pixels, torch.Generator().manual_seed(0)).draw(40)
+    batch = PixelGenerator(tiny.pixels, seeded(0)).draw(40)
     directions, inside = cell_directions()
     lights = directions[inside][3::29]
     exposure = torch.linspace(0.3, 2, 40)[:, None]
-    observations = batch.truth.radiance(lights) * exposure
+    observations = batch.truth.radiance(lights) * exposure  # type: ignore[attr-defined]
     seen = PixelBatch(
         observations,
         lights,
@@ -276,16 +273,14 @@ def test_truth_agrees_with_what_the_network_sees(tiny: TrainingConfig, mirror: b
         )
     sparse = sparse_map(observations / views.scale, turned)
     assert sparse.occupied[0].sum() == len(lights)
-    torch.testing.assert_close(
-        dense.values * sparse.occupied, sparse.values.clamp(max=1), rtol=2e-3, atol=1e-4
-    )
-    torch.testing.assert_close(normals, expected_normals)
+    assert_close(dense.values * sparse.occupied, sparse.values.clamp(max=1), rtol=2e-3, atol=1e-4)
+    assert_close(normals, expected_normals)
     assert dense.values.max() == 1  # highlights that no light has hit are cut
     assert torch.equal(dense.known, inside.float().expand(40, 1, 32, 32))
     assert torch.equal(dense.filled, dense.known)
 
 
-def test_without_li_net_the_angle_is_all(tiny: TrainingConfig, batch: PixelBatch) -> None:
+def test_without_li_net_the_angle_is_all(tiny, batch):
     # CNN-PS: no dense map is drawn or judged, and NE-Net learns from the angle alone.
     torch.manual_seed(0)
     network = SplineNet(NetworkConfig(size="paper", interpolates=False))

@@ -6,11 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
 
+from distributions import seeded
 from splinecli.errors import ModelError, UsageError
 from splinecli.estimate.networks.refine_net import FEATURE_CHANNELS
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import load_weights, resolve_weights
+from splinecli.maths.normals import unit
 from splinecli.workshop.pixel_sets.store import Pixels, PixelSet, PixelSetWriter
 from splinecli.workshop.save_weights import save_weights
 from splinecli.workshop.synthesis.batches import CaptureConfig
@@ -39,30 +43,26 @@ FLAWLESS = CaptureConfig(
 
 
 def scene(pixels: int = 300, lights: int = 8) -> tuple[torch.Tensor, torch.Tensor]:
-    generator = torch.Generator().manual_seed(3)
+    generator = seeded(3)
     directions = torch.randn(lights, 3, generator=generator).abs()
-    directions = torch.nn.functional.normalize(directions, dim=1)
+    directions = normalize(directions, dim=1)
     return torch.rand(pixels, lights, generator=generator), directions
 
 
-def test_a_flawless_capture_is_the_radiance_at_one_exposure() -> None:
+def test_a_flawless_capture_is_the_radiance_at_one_exposure():
     radiance, directions = scene()
-    observations, calibrated, _ = photograph_scene(
-        radiance, directions, FLAWLESS, torch.Generator().manual_seed(0)
-    )
+    observations, calibrated, _ = photograph_scene(radiance, directions, FLAWLESS, seeded(0))
     exposure = (observations / radiance)[radiance < 0.9].unique()
     assert 10**-0.7 / 1.01 < exposure.mean() < 1 / 0.99
-    torch.testing.assert_close(exposure, exposure[0].expand(len(exposure)))
-    torch.testing.assert_close(calibrated, directions)
+    assert_close(exposure, exposure[0].expand(len(exposure)))
+    assert_close(calibrated, directions)
 
 
-def test_ambient_light_is_the_same_in_all_images_of_a_capture() -> None:
+def test_ambient_light_is_the_same_in_all_images_of_a_capture():
     """It is between a share of the pixel's mean and of the capture's mean."""
     radiance, directions = scene()
     config = replace(FLAWLESS, ambient_share=1.0)
-    observations, _, exposure = photograph_scene(
-        radiance, directions, config, torch.Generator().manual_seed(4)
-    )
+    observations, _, exposure = photograph_scene(radiance, directions, config, seeded(4))
     added = torch.where(observations < 1, observations / exposure - radiance, torch.nan)
     assert added.nan_to_num(0).amax(1).sub(added.nan_to_num(9).amin(1)).max() < 1e-5
     means = torch.stack(
@@ -72,31 +72,27 @@ def test_ambient_light_is_the_same_in_all_images_of_a_capture() -> None:
     assert shares.min() > 0 and 10**-3.2 < shares.sum() < 0.1
 
 
-def test_errors_of_calibration_are_those_of_the_capture() -> None:
+def test_errors_of_calibration_are_those_of_the_capture():
     """Every pixel has the same factor under one light."""
     radiance, directions = scene()
     config = replace(FLAWLESS, light_intensity_error_share=1.0, unequal_lights_share=1.0)
-    observations, *_ = photograph_scene(
-        radiance, directions, config, torch.Generator().manual_seed(1)
-    )
+    observations, *_ = photograph_scene(radiance, directions, config, seeded(1))
     factors = torch.where(radiance < 0.9, observations / radiance, torch.nan)
     spread = factors.nan_to_num(0).amax(0) - factors.nan_to_num(9).amin(0)
     assert spread.max() < 1e-5
     assert factors.nanmean(0).std() > 1e-3
 
 
-def test_saturated_captures_are_restored() -> None:
+def test_saturated_captures_are_restored():
     """A matte scene whose brightest observations are clipped comes out as it was, apart from the
     exposure.
     """
-    generator = torch.Generator().manual_seed(5)
+    generator = seeded(5)
     _, directions = scene(lights=12)
-    normals = torch.nn.functional.normalize(torch.rand(400, 3, generator=generator) + 0.3, dim=1)
+    normals = normalize(torch.rand(400, 3, generator=generator) + 0.3, dim=1)
     radiance = normals @ directions.T * torch.rand(400, 1, generator=generator)
     config = replace(FLAWLESS, saturated_share=1.0)
-    observations, *_ = photograph_scene(
-        radiance, directions, config, torch.Generator().manual_seed(2)
-    )
+    observations, *_ = photograph_scene(radiance, directions, config, seeded(2))
     assert observations.max() > 1.02
     ratio = observations / radiance
     assert ratio.std() < 0.03 * ratio.mean()
@@ -112,9 +108,9 @@ def bumpy_set(tmp_path: Path) -> PixelSet:
         rng = np.random.default_rng(index)
         lights = rng.normal((0, 0, 2), 1, (9, 3))
         lights[:, 2] = np.abs(lights[:, 2]) + 0.5
-        lights = (lights / np.linalg.norm(lights, axis=1, keepdims=True)).astype(np.float32)
+        lights = unit(lights).astype(np.float32)
         normals = np.tile(np.float32((0.28 * index, 0, 0.96)), (196, 1))
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = unit(normals)
         observations = (normals @ lights.T).clip(0) * rng.uniform(0.5, 1.5, (196, 9))
         mask = np.ones((14, 14), np.bool_)
         writer.add(
@@ -151,9 +147,7 @@ def refining(
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(
-    refining: TrainingConfig, tmp_path: Path
-) -> None:
+def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(refining, tmp_path):
     trainer = Trainer(refining, tmp_path / "run", CPU)
     before = {name: tensor.clone() for name, tensor in trainer.network.state_dict().items()}
     first_deg = trainer.task.validation_deg(trainer.average, bfloat16=False)
@@ -165,9 +159,7 @@ def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_a_second_refinement_net_follows_one_that_is_trained(
-    refining: TrainingConfig, tmp_path: Path
-) -> None:
+def test_a_second_refinement_net_follows_one_that_is_trained(refining, tmp_path):
     Trainer(refining, tmp_path / "first", CPU).run()
     start_from = str(tmp_path / "first" / WEIGHTS)
     twice = replace(
@@ -198,7 +190,7 @@ def test_a_second_refinement_net_follows_one_that_is_trained(
         )
 
 
-def test_the_preset_continues_the_weights_that_it_starts_from() -> None:
+def test_the_preset_continues_the_weights_that_it_starts_from():
     refine = PRESETS["refine"]
     assert resolve_weights(refine.start_from).network.config == refine.network
 
@@ -208,11 +200,11 @@ def network_of(config: TrainingConfig) -> SplineNet:
     return SplineNet(config.network)
 
 
-def test_captures_of_a_pool(refining: TrainingConfig, bumpy_set: PixelSet) -> None:
+def test_captures_of_a_pool(refining, bumpy_set):
     network = network_of(refining)
     scenes = [(bumpy_set, bumpy_set.entries, 1.0)]
 
-    def pool(seed: int) -> ScenePool:
+    def pool(seed):
         made = ScenePool(scenes, network, refining.pixels, seed)
         made.add()
         return made
@@ -221,13 +213,11 @@ def test_captures_of_a_pool(refining: TrainingConfig, bumpy_set: PixelSet) -> No
     assert one.features.shape == (FEATURE_CHANNELS, 26, 26), "with the dark margin"
     assert torch.equal(one.features, again.features)
     assert not torch.equal(one.features, other.features)
-    drawn = pool(1).draw(3, torch.Generator().manual_seed(0))
+    drawn = pool(1).draw(3, seeded(0))
     # A turn changes no angle between estimate and truth, and so no loss before refinement.
     assert drawn.normals.shape == (3, 3, 26, 26)
     straight = refinement_losses(network, stack_maps([one])).before
-    torch.testing.assert_close(
-        refinement_losses(network, drawn).before, straight, atol=1e-3, rtol=1e-3
-    )
+    assert_close(refinement_losses(network, drawn).before, straight, atol=1e-3, rtol=1e-3)
 
 
 def test_a_run_that_continues_has_the_newest_captures(refining, bumpy_set, monkeypatch):
@@ -244,18 +234,18 @@ def test_a_run_that_continues_has_the_newest_captures(refining, bumpy_set, monke
     rest.prepare(network, rank=0, step=next_step)
     newest = list(whole.pool.examples)[-2:]
     for one, other in zip(newest, rest.pool.examples, strict=True):
-        torch.testing.assert_close(tuple(one), tuple(other), rtol=0, atol=0)
+        assert_close(tuple(one), tuple(other), rtol=0, atol=0)
     for task in (whole, rest):
         task.pool.add()
     assert torch.equal(whole.pool.examples[-1].features, rest.pool.examples[-1].features)
 
 
-def test_generated_pixels_are_no_scenes(refining: TrainingConfig, tmp_path: Path) -> None:
+def test_generated_pixels_are_no_scenes(refining, tmp_path):
     with pytest.raises(UsageError, match="rendered scenes"):
         Trainer(replace(refining, sources={"generator": 1.0}), tmp_path, CPU)
 
 
-def test_the_loss_of_detail_does_not_count_what_turns_all_normals(refining: TrainingConfig) -> None:
+def test_the_loss_of_detail_does_not_count_what_turns_all_normals(refining):
     """A plate in steps, all of it tilted as under wrong lights, or with its steps smoothed. The net
     changes nothing.
     """
@@ -263,10 +253,10 @@ def test_the_loss_of_detail_does_not_count_what_turns_all_normals(refining: Trai
     slopes = torch.zeros(2, 24, 24)
     slopes[0, :, 12:] = 0.5
 
-    def unit_of(slopes: torch.Tensor) -> torch.Tensor:
-        return torch.nn.functional.normalize(torch.cat((-slopes, torch.ones(1, 24, 24))), dim=0)
+    def unit_of(slopes):
+        return normalize(torch.cat((-slopes, torch.ones(1, 24, 24))), dim=0)
 
-    def losses_of(estimate: torch.Tensor) -> list[float]:
+    def losses_of(estimate):
         features = torch.zeros(1, FEATURE_CHANNELS, 24, 24)
         features[0, :3] = estimate
         maps = SceneMaps(features, unit_of(slopes)[None], torch.ones(1, 1, 24, 24))

@@ -10,7 +10,6 @@ import torch
 from scenes import decode_rgb
 from splinecli.records.output_files import CURVES, TRAINING_MAPS
 from splinecli.workshop.training import EVENTS, METRICS
-from splinecli.workshop.training.config import TrainingConfig
 from splinecli.workshop.training.loop import Trainer
 from splinecli.workshop.training.run_files import Metrics, RunLog, read_metrics
 
@@ -27,7 +26,7 @@ def log_of(folder: Path, rows: list[Metrics] = ROWS, *, tensorboard: bool = Fals
         log.append(row)
 
 
-def test_metrics_round_trip(tmp_path: Path) -> None:
+def test_metrics_round_trip(tmp_path):
     log_of(tmp_path)
     assert read_metrics(tmp_path / METRICS) == ROWS
     text = (tmp_path / METRICS).read_text()
@@ -39,7 +38,7 @@ def test_metrics_round_trip(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("step", "kept"), [(49, 0), (50, 1), (10**6, 3)])
-def test_lines_of_a_later_step_are_dropped(tmp_path: Path, step: int, kept: int) -> None:
+def test_lines_of_a_later_step_are_dropped(tmp_path, step, kept):
     log_of(tmp_path)
     again = RunLog(tmp_path, step)
     assert (tmp_path / METRICS).exists() == (kept > 0)
@@ -48,7 +47,7 @@ def test_lines_of_a_later_step_are_dropped(tmp_path: Path, step: int, kept: int)
 
 
 @pytest.mark.parametrize("step", ["9" * 5000, "²"])
-def test_a_last_line_that_no_parser_likes_is_dropped(tmp_path: Path, step: str) -> None:
+def test_a_last_line_that_no_parser_likes_is_dropped(tmp_path, step):
     log_of(tmp_path, ROWS[:2])
     with (tmp_path / METRICS).open("a", encoding="utf-8") as file:
         file.write(f"{step},1" + ",1.0" * 9 + "\n")
@@ -57,7 +56,7 @@ def test_a_last_line_that_no_parser_likes_is_dropped(tmp_path: Path, step: str) 
     assert read_metrics(tmp_path / METRICS) == ROWS[:2]
 
 
-def test_pictures_of_a_run(tiny: TrainingConfig, tmp_path: Path) -> None:
+def test_pictures_of_a_run(tiny, tmp_path):
     Trainer(replace(tiny, steps=2), tmp_path, torch.device("cpu")).run()
     assert {path.name for path in tmp_path.iterdir()} == {
         "checkpoint.safetensors",
@@ -71,7 +70,7 @@ def test_pictures_of_a_run(tiny: TrainingConfig, tmp_path: Path) -> None:
     assert decode_rgb((tmp_path / TRAINING_MAPS).read_bytes()).std() > 20
 
 
-def test_tensorboard_s_events(tmp_path: Path) -> None:
+def test_tensorboard_s_events(tmp_path):
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

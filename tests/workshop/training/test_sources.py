@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from distributions import generator as seeded
-from small_pixel_sets import MakeSet
+from distributions import seeded
 from splinecli.errors import InputError
 from splinecli.workshop.pixel_sets.store import Entry, PixelSet
 from splinecli.workshop.synthesis.batches import PixelBatch
@@ -52,9 +51,7 @@ def entries_of(*scenes: str) -> list[Entry]:
         (("a", "b", "c"), 0.0, 0),
     ],
 )
-def test_validation_takes_whole_scenes_and_never_all(
-    scenes: tuple[str, ...], share: float, n_validation: int
-) -> None:
+def test_validation_takes_whole_scenes_and_never_all(scenes, share, n_validation):
     entries = entries_of(*scenes)
     training, validation = split_scenes(entries, share)
     for_validation = {entry.scene for entry in validation}
@@ -81,9 +78,7 @@ def normals_of(batch: PixelBatch) -> set[tuple[float, ...]]:
     return {tuple(normal) for normal in batch.truth.normals.tolist()}
 
 
-def test_training_never_draws_from_validation_scenes(
-    make_set: MakeSet, tiny: TrainingConfig
-) -> None:
+def test_training_never_draws_from_validation_scenes(make_set, tiny):
     pixel_set = make_set(entries=[("a1", "a", 20, 20), ("b1", "b", 20, 20), ("b2", "b", 20, 20)])
     source, held = open_sources(replace(tiny, sources={str(pixel_set.folder): 1.0}))
     training, validation = source.draw(500), held.draw(300)
@@ -96,13 +91,13 @@ def test_training_never_draws_from_validation_scenes(
     assert len(counts) > 3
 
 
-def test_a_single_scene_is_validated_on_itself(make_set: MakeSet, tiny: TrainingConfig) -> None:
+def test_a_single_scene_is_validated_on_itself(make_set, tiny):
     pixel_set = make_set(entries=[("a", "one", 20, 20)])
     source, held = open_sources(replace(tiny, sources={str(pixel_set.folder): 1.0}))
     assert normals_of(held.draw(300)) == normals_of(source.draw(300))
 
 
-def test_a_set_and_the_generator_together(make_set: MakeSet, tiny: TrainingConfig) -> None:
+def test_a_set_and_the_generator_together(make_set, tiny):
     pixel_set = make_set()
     config = replace(tiny, sources={str(pixel_set.folder): 1.0, GENERATOR: 3.0})
 
@@ -129,9 +124,7 @@ def test_a_set_and_the_generator_together(make_set: MakeSet, tiny: TrainingConfi
     assert {batch.truth.dense_truth(32).values.shape for batch in training} == {(5, 1, 32, 32)}
 
 
-def test_a_validation_shape_of_one_set_is_not_trained_on_in_another(
-    make_set: MakeSet, tiny: TrainingConfig
-) -> None:
+def test_a_validation_shape_of_one_set_is_not_trained_on_in_another(make_set, tiny):
     # Both sets have the same three shapes under other names.
     one, other = (
         make_set(names, entries=[(name, name, 20, 20) for name in names])
@@ -150,6 +143,6 @@ def test_a_validation_shape_of_one_set_is_not_trained_on_in_another(
         open_sets(replace(tiny, sources={str(alone.folder): 1.0, str(rest.folder): 1.0}))
 
 
-def test_sources_without_weight_are_not_opened(tiny: TrainingConfig) -> None:
+def test_sources_without_weight_are_not_opened(tiny):
     source, _ = open_sources(replace(tiny, sources={"/no/such/set": 0.0, GENERATOR: 1.0}))
     assert isinstance(source, PixelGenerator)
