@@ -298,6 +298,8 @@ def json_schema() -> dict[str, Any]:
     references, parts = schema_components(
         (Report, SurfaceReport, Results, Failure), ref_template="#/$defs/{name}"
     )
+    for part in parts.values():  # the text of a docstring, without its line breaks
+        part["description"] = " ".join(part["description"].split())
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "Documents of splinecli: report.json, surface.json, results.json, and the"
