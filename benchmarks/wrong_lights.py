@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from splinecli.capture import open_capture
 from splinecli.capture.light_rows import parse_light_frame
+from splinecli.capture.sample import sample_observations
 from splinecli.judge.light_check import LightCheck, check_lights, mirror_twin
 from splinecli.judge.light_order import UNKNOWN_ORDER
-from splinecli.judge.summary import sample_observations
 from splinecli.lights.draws import draw_lights
 from splinecli.lights.light_fit import find_factors
 from splinecli.recipe import RecipeOptions, prepare_capture

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 # Everything else is imported inside the functions, because PyTorch takes a second or more to load.
 
 
-def estimate_normals(
+def estimate_normals(  # noqa: PLR0913 - keyword arguments suit a notebook
     images: ArrayLike | Sequence[NDArray[Any]],
     light_directions: ArrayLike | None = None,
     mask: ArrayLike | None = None,

@@ -9,9 +9,8 @@ from judged import warnings_of
 from scenes import cap_directions, directions_at, halfway, ring_lights, shade, spiral_lights
 from splinecli.capture import Capture
 from splinecli.capture.arrays import open_arrays
-from splinecli.capture.sample import Sample
+from splinecli.capture.sample import CLOSEUP_SIDE, Sample, closeup_of, leave_out_background
 from splinecli.judge.checks import light_spread, repeated_images
-from splinecli.judge.summary import CLOSEUP_SIDE, closeup_of, leave_out_background
 from splinecli.recipe import prepare_capture
 
 

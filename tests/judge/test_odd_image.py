@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 import scenes
 from scenes import spiral_lights
 from splinecli.capture.light_rows import parse_light_frame
+from splinecli.capture.sample import sample_observations
 from splinecli.judge.light_check import check_lights
 from splinecli.judge.odd_images import OddImage, check_ground_truth, find_odd_image
-from splinecli.judge.summary import sample_observations
 from splinecli.lights.light_fit import find_factors
 from splinecli.maths.normals import unit
 

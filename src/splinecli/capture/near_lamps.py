@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -307,6 +307,23 @@ _OPTIONS = {
 NO_LAMP_OPTIONS = LampOptions()
 
 
+class Lit(Protocol):
+    """What near lamps need to know of the images that they light, such as a CaptureSource."""
+
+    @property
+    def n_lights(self) -> int: ...
+    @property
+    def light_directions(self) -> Float64Array: ...
+    @property
+    def light_frame(self) -> LightFrame: ...
+    @property
+    def intensities_measured(self) -> bool: ...
+    @property
+    def camera_matrix(self) -> Float64Array | None: ...
+    @property
+    def window(self) -> Window: ...
+
+
 @dataclass(frozen=True, eq=False)
 class LampFiles:
     """Near lamps as given by files and options, before the lights and the images are read."""
@@ -335,17 +352,17 @@ class LampFiles:
             text += f"; the object is {self.options.object_width:g} wide"
         return text if self.lobes is None else f"{text}; lobes as in {self.lobes}"
 
-    def over(self, source: Any, mask: Bools, *, step: int = 1) -> NearLamps | None:
-        """Return all lamps of a CaptureSource over a mask (H, W) of every step-th row and column;
-        None without a scale.
+    def over(self, source: Lit, mask: Bools, *, step: int = 1) -> NearLamps | None:
+        """Return all lamps over a mask (H, W) of every step-th row and column; None without a
+        scale.
 
         Raises InputError.
         """
-        window: Window = source.window
-        camera_matrix: Float64Array | None = source.camera_matrix
+        window, camera_matrix = source.window, source.camera_matrix
         if self.positions is not None:
             positions = read_light_positions(self.positions, source.n_lights, source.light_frame)
         else:
+            assert self.options.distance is not None  # without positions, it makes them
             positions = source.light_directions * self.options.distance
         # float32 holds the squares of distances up to 1e19.
         if (farthest := np.abs(positions).max(initial=0)) > 1e15:

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from splinecli.capture import Capture, CaptureOptions, CaptureSource, open_capture
 from splinecli.capture.record import in_one_plane
+from splinecli.capture.sample import sample_observations
 from splinecli.errors import InputError
 from splinecli.estimate.inference import estimate_normals, find_surface
 from splinecli.estimate.methods import Estimator
 from splinecli.evaluation.protocol import NOISE_STREAM, PIXELS_STREAM, Protocol
 from splinecli.judge.odd_images import check_ground_truth
-from splinecli.judge.summary import sample_observations
 from splinecli.lights.draws import Draw
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.recipe.steps import begin, follow

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from splinecli.capture import Capture
+from splinecli.capture.sample import leave_out_background
 from splinecli.capture.source import Source
 from splinecli.errors import InputError
 from splinecli.images.lamps import estimate_light_intensities
@@ -16,7 +17,6 @@ from splinecli.judge.evidence import Evidence
 from splinecli.judge.explanations import LIKELY, SRGB_EXPONENT, Explanation, Kind
 from splinecli.judge.light_check import LightCheck, light_warnings
 from splinecli.judge.odd_images import check_ground_truth
-from splinecli.judge.summary import leave_out_background
 from splinecli.lights.light_fit import would_refine
 from splinecli.lights.rough_normals import median_turn_deg
 from splinecli.maths import Float64Array, Floats

@@ -14,13 +14,12 @@ import numpy as np
 from splinecli.capture import Capture
 from splinecli.capture.light_rows import USUAL_FRAME, LightFrame
 from splinecli.capture.near_lamps import NearLamps
-from splinecli.capture.sample import Sample
+from splinecli.capture.sample import Sample, closeup_of, sample_observations
 from splinecli.capture.source import Source
 from splinecli.judge.explanations import Doubt, Explanations, Kind
 from splinecli.judge.light_check import LightCheck, check_lights
 from splinecli.judge.odd_images import ImageShift, find_shifts
 from splinecli.judge.shading_shifts import moved_back, shading_shifts
-from splinecli.judge.summary import closeup_of, sample_observations
 from splinecli.lights.light_fit import Factors, find_factors
 from splinecli.lights.rough_normals import median_turn_deg
 from splinecli.maths import Float64Array, Floats

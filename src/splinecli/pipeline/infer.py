@@ -6,7 +6,7 @@ network.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, partial
@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splinecli.capture import Capture, CaptureSource, capture_name
 from splinecli.capture.files import digest
@@ -28,6 +27,7 @@ from splinecli.estimate.methods import DEFAULT_METHOD, Estimator, MethodOptions,
 from splinecli.estimate.methods.estimator import FEWEST_TO_DISTIL, student_sizes
 from splinecli.judge.checks import check_confidence, refuse_if_strict
 from splinecli.lights.draws import draw_lights
+from splinecli.maths import Bools, Float32Array
 from splinecli.pictures.maps import encode_png
 from splinecli.pictures.plots import sky_plot
 from splinecli.pipeline.expected_seconds import AUTOMATIC_FROM, expected_seconds
@@ -64,7 +64,7 @@ from splinecli.surface.make import SurfaceSettings, make_surface
 from splinecli.surface.mesh import Textures, check_triangles
 from splinecli.surface.surface_files import DEFAULT_FORMATS, encode_surface
 from splinecli.system.files import expanded, file_sha256
-from splinecli.system.progress import SILENT, Clock, Observer
+from splinecli.system.progress import SILENT, Clock, Observer, ignore
 from splinecli.system.publishing import Content, held_folder, refuse_link
 
 if TYPE_CHECKING:
@@ -391,65 +391,40 @@ def _make_files(
     """
     capture = estimate.capture
     clock.begin("pictures", note="maps")
-    made: dict[str, NDArray[np.float32]] = {}
-    for row in chosen_maps(options.maps, page=options.html):
-        if not (row.bytes_per_pixel or (options.html and row.caption)):
-            continue  # computed when it is written
-        if row.reads_images:
-            count = partial(clock.begin("pictures", capture.n_lights, row.name), 1)
-            values = make_map(row, source, estimate, count)
-        else:
-            values = make_map(row, source, estimate)
-        if values is not None:
-            made[row.name] = values
-    gloss = specular = None
+    made = _costly_maps(source, estimate, options, clock)
     if "material" in made:
         facts = material_facts(made["material"], capture.mask)
         report["material"] = facts.as_dict()
-        gloss, specular = (
-            gloss_picture(made["material"][..., 3:5], capture.mask),
-            made["material"][..., 5],
-        )
         for warning in material_warnings(facts):
             report["warnings"].append({"code": warning.code, "text": warning.text})
             observer.warn(f"{capture.name}: {warning}")
     scales = dict(options.map_scales)
 
     def map_of(row: OutputMap) -> Iterator[tuple[str, Content]]:
-        """Yield the files of a map, which is computed when they are written unless it already
-        exists.
-        """
+        """Yield the files of a map, which is computed when they are written unless it exists."""
         values = made[row.name] if row.name in made else make_map(row, source, estimate)
         if values is not None:
-            yield from map_files(
-                row, values, capture.mask, options.formats, scale=scales.get(row.name)
-            )
+            scale = scales.get(row.name)
+            yield from map_files(row, values, capture.mask, options.formats, scale=scale)
 
     found: list[Iterable[tuple[str, Content]]] = [
         files.normal_files(estimate, options.formats, options.convention),
         *map(map_of, chosen_maps(options.maps)),
     ]
     light_plot = None
-    if capture.light_errors_deg is not None:
-        light_plot = sky_plot(
-            capture.light_directions, capture.name, errors_deg=capture.light_errors_deg
-        )
+    if (errors_deg := capture.light_errors_deg) is not None:
+        light_plot = sky_plot(capture.light_directions, capture.name, errors_deg=errors_deg)
         found.append(files.light_files(capture, light_plot))
     if source.automatic_mask is not None:
         found.append([(FOUND_MASK, encode_png(source.window.filled(capture.mask) * np.uint8(255)))])
     if options.surface:
         advance = clock.begin("surface", note="integrating")
         camera_matrix, pixel_size = view_of_report(report)
-        colours = (
-            map_picture(MAPS["albedo"], made["albedo"], capture.mask) if "albedo" in made else None
-        )
-        if gloss is not None:  # highlights are not part of the base colour
-            colours = base_colour_picture(made["material"][..., :3], capture.mask)
         surface, report["surface"] = make_surface(
             estimate.normal_map,
             capture.mask,
             camera_matrix,
-            Textures(colours, gloss, specular),
+            _textures(made, capture.mask),
             SurfaceSettings(options.discontinuity, pixel_size),
             advance,
         )
@@ -468,6 +443,39 @@ def _make_files(
         )
         found.append([(PAGE, page)])
     return found
+
+
+def _costly_maps(
+    source: CaptureSource, estimate: NormalEstimate, options: InferOptions, clock: Clock
+) -> dict[str, Float32Array]:
+    """Return the maps that need much memory or are on the page; the others are computed when they
+    are written.
+    """
+    made: dict[str, Float32Array] = {}
+    for row in chosen_maps(options.maps, page=options.html):
+        if not (row.bytes_per_pixel or (options.html and row.caption)):
+            continue
+        count: Callable[[], object] = ignore
+        if row.reads_images:
+            n_images = estimate.capture.n_lights
+            count = partial(clock.begin("pictures", n_images, row.name), 1)
+        values = make_map(row, source, estimate, count)
+        if values is not None:
+            made[row.name] = values
+    return made
+
+
+def _textures(made: Mapping[str, Float32Array], mask: Bools) -> Textures:
+    """Return the textures of a mesh from the maps that were made."""
+    if (material := made.get("material")) is not None:
+        return Textures(  # highlights are not part of the base colour
+            base_colour_picture(material[..., :3], mask),
+            gloss_picture(material[..., 3:5], mask),
+            material[..., 5],
+        )
+    if (albedo := made.get("albedo")) is not None:
+        return Textures(map_picture(MAPS["albedo"], albedo, mask))
+    return Textures()
 
 
 def results_bytes(

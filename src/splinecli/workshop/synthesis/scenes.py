@@ -108,7 +108,7 @@ class _Vertices:
         )
 
 
-def render_indirect(
+def render_indirect(  # noqa: PLR0913 - the parts of a scene, and how it is traced
     tracer: Tracer,
     visible: VisibleSurface,
     lights: Floats,
