@@ -19,11 +19,11 @@ from collections.abc import Sequence
 
 import torch
 
-from splinecli.estimate.methods.batched import NetworkEstimator, Precision
+from splinecli.estimate.methods.batched import NetworkEstimator
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import LoadedNetwork, resolve_weights
-from splinecli.system.machine import choose_precision
+from splinecli.system.machine import Precision, choose_precision
 from splinecli.workshop.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 
 

@@ -298,7 +298,7 @@ def json_schema() -> dict[str, Any]:
     references, parts = schema_components(
         (Report, SurfaceReport, Results, Failure), ref_template="#/$defs/{name}"
     )
-    for part in parts.values():
+    for part in parts.values():  # the text of a docstring, without its line breaks
         if "description" in part:
             part["description"] = " ".join(part["description"].split())
     return {
