@@ -320,7 +320,7 @@ def test_light_files_that_are_named(folder, name, text, hint):
     with pytest.raises(InputError, match=hint) as refused:
         open_capture(folder)
     _, lights, *form = str(refused.value.hint).removeprefix("Add ").split()
-    options = {"lights_format": form[1]} if form else {}
+    options = {"light_format": form[1]} if form else {}
     assert check(open_capture(folder, CaptureOptions(lights=lights, **options)), None) == []
 
 

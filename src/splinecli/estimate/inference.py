@@ -123,7 +123,7 @@ def estimate_normals(
     follow, and shows them. Raises SplinecliError if the normals are not unit vectors.
 
     Examples:
-        >>> from splinecli.capture import read_capture
+        >>> from splinecli.recipe import read_capture
         >>> from splinecli.estimate.inference import estimate_normals
         >>> from splinecli.estimate.methods import make_estimator
         >>> estimate = estimate_normals(read_capture("examples/medallion"), make_estimator("ls"))

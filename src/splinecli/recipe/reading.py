@@ -18,6 +18,7 @@ from splinecli.records import capture_warnings as codes
 from splinecli.records.capture_warnings import CaptureWarning
 
 DARK = 0.05  # an image is dark if its 99 % quantile is below this share of the white level
+MOSTLY_SATURATED = 0.2  # share of an image's pixels from which it is named
 _ENOUGH = 1_000_000  # values for a quantile: its rank is uncertain by 0.01 % of the pixels
 
 
@@ -110,9 +111,13 @@ def exposure_warnings(observed: Observed, *, inverted: bool) -> list[CaptureWarn
     warnings = white_level_warnings(saturation.white_level)
     saturated = int(saturation.n_saturated.sum()) / max(n_pixels * n_images, 1)
     if saturated > codes.SATURATED_SHARE:
+        worst = max(observed.images, key=lambda image: image.saturated)
+        most = ""
+        if worst.saturated > MOSTLY_SATURATED:
+            most = f", most of them in {worst.path.name} ({100 * worst.saturated:.1f} %)"
         text = (
-            f"{100 * saturated:.1f} % of the observations are saturated; a shorter exposure gives"
-            " better normals."
+            f"{100 * saturated:.1f} % of the observations are saturated{most}; a shorter exposure"
+            " gives better normals."
         )
         warnings.append(CaptureWarning(codes.SATURATED, text))
     lit = observed.observations[:n_pixels].any(axis=1)

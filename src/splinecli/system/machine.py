@@ -202,7 +202,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 Device = Literal["auto", "cpu", "cuda"]
 NumberFormat = Literal["float32", "bfloat16"]
-Precision = Literal["auto"] | NumberFormat
+Precision = Literal["auto", "float32", "bfloat16"]
 
 
 def choose_device(name: Device | str) -> torch.device:
