@@ -1,11 +1,12 @@
 """Render scenes for the light network and train it: how assets/light-net.safetensors was made.
 
-    python benchmarks/train_light_net.py render FOLDER --scenes 960
+    python benchmarks/train_light_net.py render FOLDER --scenes 2400
     python benchmarks/train_light_net.py train FOLDER --minutes 85 -o light-net.safetensors
 
 Both go on after an interruption. The shipped weights saw 1,880 scenes in three classes of materials
 each, in two legs of 22,000 and 11,000 steps: about 300,000 captures. The second leg began from the
-first with a rate of 0.0012, and had twice the scenes.
+first with a rate of 0.0012, and had twice the scenes. These scenes had no groups and few hollows,
+and the captures up to 100 lights.
 """
 
 import argparse
@@ -17,11 +18,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
 from torch.utils.data import DataLoader, IterableDataset
 
 from splinecli.lights.light_net import LIGHT_FORMAT, LightNet, network_inputs, square_images
 from splinecli.workshop.save_weights import save_module
-from splinecli.workshop.synthesis import draw_number, shapes
+from splinecli.workshop.synthesis import draw_number, groups, shapes
 from splinecli.workshop.synthesis.draw_materials import CLASSES
 from splinecli.workshop.synthesis.lights import choose_in_cone, draw_light_directions
 from splinecli.workshop.synthesis.meshes import (
@@ -36,31 +38,42 @@ from splinecli.workshop.synthesis.whole_capture import add_background
 
 CONFIG = SceneConfig(size=72, lights=64, samples=2, directions=24, bounces=2)
 SPACING, FEWEST_FACES = 0.025, 1500  # coarser than other scenes: the network sees 48 pixels
-SMOOTH_SHARE = 0.56
+# Shares of smooth shapes, and of bowls, niches and bodies beside each other; the others are random
+# shapes.
+SMOOTH_SHARE, GROUP_SHARE = 0.35, 0.35
 HELD_SHARE = 0.04
 IMAGES_PER_STEP, MOST_CAPTURES = 96, 16
 RATE = 2e-3
 
 
 def render(folder: Path, scenes: int, seed: int = 1) -> None:
-    """Render scenes that the folder does not have: random shapes, and smooth ones, which are rare
-    among them.
-    """
+    """Render scenes that the folder does not have: random shapes, smooth ones, and groups."""
     shapes.SPACING, shapes.FEWEST_FACES = SPACING, FEWEST_FACES
+    groups.SPACING, groups.FEWEST_FACES = 0.04, 500
     folder.mkdir(parents=True, exist_ok=True)
     for index in range(scenes):
         path = folder / f"{index:05d}.npz"
         if path.exists():
             continue
         rng = np.random.default_rng([seed, index, 77])
-        mesh = draw_smooth(rng) if rng.random() < SMOOTH_SHARE else None
+        kind, mesh = rng.random(), None
+        if kind < SMOOTH_SHARE:
+            mesh = draw_smooth(rng)
+        elif kind < SMOOTH_SHARE + GROUP_SHARE:
+            _, mesh = groups.draw_group(rng, (), rng.random())
         scene = draw_scene(seed, index, CONFIG, mesh)
         done = render_scene(scene, CONFIG)
         observations = {
             name: values.astype(np.float16) for name, values in done.observations.items()
         }
         new = path.with_suffix(".tmp.npz")
-        np.savez(new, mask=done.mask, lights=scene.lights, **observations)
+        np.savez(
+            new,
+            mask=done.mask,
+            lights=scene.lights,
+            normals=done.normals.astype(np.float16),
+            **observations,
+        )
         new.replace(path)
         print(path, flush=True)
 
@@ -73,7 +86,7 @@ def draw_smooth(rng: np.random.Generator) -> Mesh:
     else:
         radii = [rng.uniform(0.25, 0.6) * rng.uniform(0.5, 1.3, 3) for _ in range(count)]
         solids = [
-            shapes._place(ellipsoid(radius.astype(np.float32)), rng, (0.0, 0.45))
+            shapes.place_solid(ellipsoid(radius.astype(np.float32)), rng, (0.0, 0.45))
             for radius in radii
         ]
     blend = rng.uniform(0.03, 0.3)
@@ -90,8 +103,8 @@ def draw_smooth(rng: np.random.Generator) -> Mesh:
 
 
 class Captures(IterableDataset):
-    """Endless batches of captures: inputs (B, F, C, S, S), directions (B, F, 3) and log intensities
-    (B, F).
+    """Endless batches of captures: inputs (B, F, C, S, S), directions (B, F, 3), log intensities
+    (B, F), bumps (B,).
     """
 
     def __init__(self, folder: Path, first: int, *, held: bool) -> None:
@@ -100,27 +113,31 @@ class Captures(IterableDataset):
         self.files = files[:n_held] if held else files[n_held:]
         self.first, self.held = first, held
 
-    def __iter__(self) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    def __iter__(self) -> Iterator[tuple[Tensor, ...]]:
         torch.set_num_threads(1)
         step = self.first
         while True:
             generator = torch.Generator().manual_seed(1_000_003 * (1 + self.held) + step)
-            usual, other = torch.rand(2, generator=generator).tolist()
-            lights = 10 if usual < 0.25 else int(4 * (25 / 4) ** other)
-            captures: list[tuple[Tensor, Tensor, Tensor]] = []
+            lights = int(4 * (31 / 4) ** draw_number(generator))
+            captures: list[tuple[Tensor, ...]] = []
             while len(captures) < max(2, min(MOST_CAPTURES, IMAGES_PER_STEP // lights)):
                 file = self.files[int(torch.randint(len(self.files), (), generator=generator))]
                 captures += photograph(file, lights, generator)
-            images, directions, intensities = (
-                torch.stack(part) for part in zip(*captures, strict=True)
-            )
-            yield images, directions, intensities
+            yield tuple(torch.stack(part) for part in zip(*captures, strict=True))
             step += 1
 
 
-def photograph(
-    file: Path, count: int, generator: torch.Generator
-) -> list[tuple[Tensor, Tensor, Tensor]]:
+def bump_of(normals: Tensor, mask: Tensor) -> Tensor:
+    """Return how much of a bump the normals (3, H, W) in a mask (H, W) show: 1 for a sphere, -1 for
+    a bowl.
+    """
+    rows, columns = mask.nonzero().T.float()
+    across = torch.stack((columns - columns.mean(), rows.mean() - rows))
+    slopes = normals[:2, mask]
+    return (slopes * across).sum() / (slopes.norm(dim=0) * across.norm(dim=0)).sum().clamp(min=1e-6)
+
+
+def photograph(file: Path, count: int, generator: torch.Generator) -> list[tuple[Tensor, ...]]:
     """Photograph a scene under `count` lights, with the faults of a capture; an empty list where
     too little is seen.
 
@@ -135,20 +152,20 @@ def photograph(
         lights, mask = torch.from_numpy(scene["lights"]).float(), torch.from_numpy(scene["mask"])
         chosen = choose(lights, count, generator)
         lights = lights[chosen]
-        images = torch.zeros(count, *mask.shape)
+        images, normals = torch.zeros(count, *mask.shape), torch.zeros(3, *mask.shape)
         images[:, mask] = (
             torch.from_numpy(scene[list(CLASSES)[int(3 * uniform())]][:, chosen.numpy()]).float().T
         )
+        normals[:, mask] = torch.from_numpy(scene["normals"]).float().T
     if uniform() < 0.3:
         side = int(min(mask.shape) * uniform(0.35, 0.8))
         top, left = (int(uniform(0, size - side)) for size in mask.shape)
         part = slice(top, top + side), slice(left, left + side)
-        images, mask = images[:, *part], mask[part]
+        images, normals, mask = images[:, *part], normals[:, *part], mask[part]
     if mask.sum() < 150:
         return []
+    bump = bump_of(normals, mask)
     if uniform() < 0.25:
-        normals = torch.zeros(3, *mask.shape)
-        normals[2] = 1
         maps, mask = add_background(torch.cat((images, normals)), mask, lights, generator)
         images = maps[:count]
     images, inside = square_images(images, mask)
@@ -177,7 +194,9 @@ def photograph(
     if uniform() < 0.1:  # an unknown curve
         images = images ** uniform(0.8, 1.2)
     directions = torch.stack((x, y, z), dim=1)
-    return [(network_inputs(images, inside).half(), directions, intensities - intensities.mean())]
+    return [
+        (network_inputs(images, inside).half(), directions, intensities - intensities.mean(), bump)
+    ]
 
 
 def choose(lights: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -196,10 +215,11 @@ def choose(lights: Tensor, count: int, generator: torch.Generator) -> Tensor:
 
 
 def losses(
-    network: LightNet, images: Tensor, directions: Tensor, intensities: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the negative log likelihood of the directions, their mean angle in radians, and the
-    error of the logs.
+    network: LightNet, images: Tensor, directions: Tensor, intensities: Tensor, bump: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the negative log likelihood of the directions, their mean angle in radians, the error
+    of the logs, and the cross entropy of bumps and hollows, of which those in between count for
+    both.
     """
     guess = network(images.float())
     cosine = (guess.directions * directions).sum(dim=-1)
@@ -208,7 +228,8 @@ def losses(
         sharpness * (1 - cosine) - guess.sharpness + torch.log1p(-torch.exp(-2 * sharpness))
     )
     angle = cosine.clamp(-0.99999, 0.99999).acos()
-    return likelihood.mean(), angle.mean(), (guess.log_intensities - intensities).abs().mean()
+    side = binary_cross_entropy_with_logits(guess.bump, (0.5 + 2 * bump).clamp(0, 1))
+    return likelihood.mean(), angle.mean(), (guess.log_intensities - intensities).abs().mean(), side
 
 
 def train(folder: Path, minutes: float, output: Path) -> None:
@@ -234,9 +255,9 @@ def train(folder: Path, minutes: float, output: Path) -> None:
         rate = RATE * min(1, (step + 1) / 100) * (1 + math.cos(math.pi * done)) / 2 + 1e-6
         for group in optimiser.param_groups:
             group["lr"] = rate
-        likelihood, angle, intensity = losses(network, *next(batches))
+        likelihood, angle, intensity, side = losses(network, *next(batches))
         optimiser.zero_grad()
-        (likelihood + 3 * angle + 0.3 * intensity).backward()
+        (likelihood + 3 * angle + 0.3 * intensity + 0.3 * side).backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
         optimiser.step()
         step += 1

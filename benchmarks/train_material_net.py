@@ -29,7 +29,7 @@ from splinecli.system.weight_files import SHIPPED
 from splinecli.workshop.save_weights import save_module
 from splinecli.workshop.synthesis import draw_uniform
 from splinecli.workshop.synthesis.batches import PixelBatch
-from splinecli.workshop.synthesis.lights import draw_light_counts, draw_light_directions
+from splinecli.workshop.synthesis.lights import draw_light_directions
 from splinecli.workshop.synthesis.pixels import PixelGeneratorConfig, PixelScene, draw_scene
 from splinecli.workshop.synthesis.whole_capture import photograph_captures
 
@@ -106,9 +106,7 @@ def draw_batch(are_narrow: bool, generator: torch.Generator) -> PixelBatch:
         if mixed is not None:
             mixed = replace(mixed, normals=narrow(mixed.normals))
         scene = replace(scene, normals=narrow(scene.normals), mixed=mixed)
-    counts = draw_light_counts(
-        CAPTURES, config.min_lights, config.max_lights, config.usual_lights, generator
-    )
+    counts = config.light_counts(CAPTURES, generator)
     directions = draw_light_directions(CAPTURES, int(counts.max()), generator).repeat(PIXELS, 1, 1)
     valid = torch.arange(directions.shape[1]) < counts.repeat(PIXELS)[:, None]
     return photograph_captures(

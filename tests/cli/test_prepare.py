@@ -184,6 +184,33 @@ def test_scenes_and_a_mesh_are_rendered(run, cube, monkeypatch):
     ) == (5, True)
 
 
+def test_groups_have_the_meshes_as_bodies(run, cube, monkeypatch):
+    monkeypatch.setattr("splinecli.workshop.synthesis.shapes.SPACING", 0.05)
+    monkeypatch.setattr("splinecli.workshop.synthesis.groups.SPACING", 0.05)
+    monkeypatch.setattr("splinecli.workshop.synthesis.groups.FEWEST_FACES", 100)
+    arguments = (
+        "prepare",
+        "--mesh",
+        cube,
+        "--groups",
+        2,
+        "--size",
+        16,
+        "--n-lights",
+        20,
+        "-o",
+        "set",
+    )
+    result = run(*arguments)
+    assert result.code == 0 and result.out.startswith("set: 18 entries of 2 scenes, ")
+    manifest = json.loads(Path("set/manifest.json").read_text())
+    assert {entry["scene"] for entry in manifest["entries"]} == {"group0000", "group0001"}
+    assert not Path("set/cube-diffuse").exists()
+    # With --views, the mesh is also rendered alone; the groups stay.
+    assert run(*arguments, "--views", 1).out.startswith("set: 27 entries of 3 scenes, ")
+    assert run(*arguments, "--mesh", "cube.obj").code == 5
+
+
 def test_workers_render_the_same_set(run, cube):
     pytest.importorskip("distributed", reason="needs the extra 'cluster'")
     Path("block.obj").write_text(cube.read_text())

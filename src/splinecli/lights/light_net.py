@@ -25,6 +25,9 @@ class LightGuess(NamedTuple):
     sharpness: Tensor  # (B, F), the logarithms of the concentrations of these distributions
     # (B, F), the logarithms of the intensities; their mean over each capture is zero
     log_intensities: Tensor
+    # (B,), the logit that the object is a bump, not a hollow; the shipped weights were not trained
+    # for it
+    bump: Tensor
 
 
 class LightNet(nn.Module):
@@ -75,9 +78,8 @@ class LightNet(nn.Module):
         # The limits correspond to errors of 90 degrees and 1 degree.
         sharpness = (3 + found[..., 3]).clamp(-2.0, 8.5)
         intensities = found[..., 4] - found[..., 4].mean(dim=1, keepdim=True)
-        return LightGuess(
-            normalize(torch.cat((found[..., :2], height), dim=-1), dim=-1), sharpness, intensities
-        )
+        directions = normalize(torch.cat((found[..., :2], height), dim=-1), dim=-1)
+        return LightGuess(directions, sharpness, intensities, found[..., 5].mean(dim=1))
 
 
 def _with_all(x: Tensor, lights: int) -> Tensor:

@@ -383,7 +383,7 @@ def _ask_network(
     network = light_net()
     # One thread each, so that the number of threads does not change the rounding.
     guesses = [*side_by_side(lambda view: _view(network, images, inside, *view), _VIEWS)]
-    directions, sharpness, log_intensities = (
+    directions, sharpness, log_intensities, _ = (
         torch.cat(part).double() for part in zip(*guesses, strict=True)
     )
     towards = (sharpness.exp()[..., None] * directions).sum(dim=0)

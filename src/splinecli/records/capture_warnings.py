@@ -77,9 +77,6 @@ CONSTANT_LIGHT = fault(
 DARK_IMAGES = WarningKind(
     "dark_images", "The images use a small part of the range", "Use a longer exposure"
 )
-DIFFERENT_SIZES = WarningKind(
-    "different_sizes", "The images have different sizes", "Export them in one size"
-)
 DISPLAY_DECODED = WarningKind(
     "display_decoded",
     "The image files specify a transfer curve, as JPEG files do, and are read with it",

@@ -27,6 +27,13 @@ class PrepareOptions(Display, frozen=True, kw_only=True):
     white_level: shared.GivenWhiteLevel = None
     update: shared.Update = False
     scenes: Natural = option("Scenes", "Render N random scenes.", "N", value=0)
+    groups: Natural = option(
+        "Scenes",
+        "Render N random groups of bodies. The meshes are among the bodies, and rendered alone only"
+        " with --views.",
+        "N",
+        value=0,
+    )
     meshes: tuple[Path, ...] = option(
         "Scenes",
         "Render a scene of this mesh (PLY, OBJ, STL, OFF). May be repeated.",

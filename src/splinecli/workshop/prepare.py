@@ -42,11 +42,12 @@ def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> d
         options.meshes,
         options.views,
         options.reliefs,
+        options.groups,
     )
     captures = [folder for source in options.sources for folder in find_captures(source)]
     if not captures and not plan.names:
         raise UsageError(
-            "nothing to prepare", hint="Name a SOURCE, or add --scenes N or --mesh FILE"
+            "nothing to prepare", hint="Name a SOURCE, or add --scenes N, --groups N or --mesh FILE"
         )
     check_writable(output)
     plan.check_inputs()

@@ -2,6 +2,8 @@
 others.
 """
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -27,15 +29,16 @@ from splinecli.estimate.refinement.features import (
     turn_features,
     turn_maps,
 )
+from splinecli.workshop.training.loop import enlarged
 from tiny_networks import TINY, random_network
 
 HEIGHT, WIDTH = 6, 9
 
 
-def random_net(*, twice: bool = False) -> RefineNet:
+def random_net(**settings: Any) -> RefineNet:
     """A net whose every layer does something."""
     generator = seeded(0)
-    net = RefineNet(twice=twice)
+    net = RefineNet(**settings)
     with torch.no_grad():
         for parameter in net.parameters():
             parameter.copy_(0.1 * torch.randn(parameter.shape, generator=generator))
@@ -246,3 +249,33 @@ def test_attention_and_mean_are_those_of_the_formulas():
             heads.append(weights @ values[:, part])
         seen = torch.cat((queries[pixel], *heads, layer.pooled(sample).mean(dim=0)))
         assert_close(found[pixel], tokens[pixel] + layer.join(seen), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "larger", [{"widths": (48, 96, 144, 96)}, {"reads_blur": True}, {"layers": 1}], ids=str
+)
+def test_a_larger_net_begins_with_the_results_of_the_smaller_one(larger):
+    small, large = random_net(), RefineNet(**larger).eval()
+    own = large.state_dict()
+    large.load_state_dict(
+        own | {name: enlarged(values, own[name]) for name, values in small.state_dict().items()}
+    )
+    for found, expected in zip(
+        large(*random_maps(24, 40)), small(*random_maps(24, 40)), strict=True
+    ):
+        assert_close(found, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_attention_reaches_the_whole_mask_and_nothing_outside():
+    net = random_net(layers=1)
+    features, mask = random_maps(16, 400)
+    mask[..., 240:] = 0
+    mask[..., 0, 239] = 1
+    features = features * mask
+    near = net(features, mask)[0]
+    assert_close(
+        net(features[..., :240], mask[..., :240])[0], near[..., :240], atol=1e-4, rtol=1e-4
+    )
+    changed = features.clone()
+    changed[..., 0, 239] += mask[..., 0, 239]
+    assert not torch.equal(net(changed, mask)[0][..., 0], near[..., 0]), "239 pixels away"

@@ -20,6 +20,7 @@ from splinecli.workshop.synthesis.meshes import (
     moved,
     smooth_cut,
     smooth_union,
+    split_long_edges,
     torus,
     triangulate,
 )
@@ -120,3 +121,48 @@ def test_images_agree(scene, rendered, benchmark, name, bounces, most_off):
     assert len(difference) > 40
     assert difference.mean() < most_off * np.mean(theirs)
     assert np.mean(mine) == pytest.approx(np.mean(theirs), rel=0.02)
+
+
+def corner() -> Mesh:
+    """Two plates that meet at a right angle in a valley along y, open to the camera."""
+    sides = [
+        [(-1, -1, 1), (0, -1, 0), (0, 1, 0), (-1, 1, 1)],
+        [(0, -1, 0), (1, -1, 1), (1, 1, 1), (0, 1, 0)],
+    ]
+    faces = [(0, 1, 2), (0, 2, 3), (4, 5, 6), (4, 6, 7)]
+    normals = np.array([(1, 0, 1)] * 4 + [(-1, 0, 1)] * 4, np.float32) / np.sqrt(np.float32(2))
+    mesh = Mesh(np.array(sides, np.float32).reshape(8, 3), np.array(faces, np.int32), normals)
+    return split_long_edges(mesh, longest=0.03)
+
+
+def test_glossy_plates_mirror_each_other_sharply(benchmark):
+    """Most of the light of this metal was reflected twice. With blunt lobes, it is in the wrong
+    places.
+    """
+    lights = np.array([(0.3, 0.2, 0.9), (0.6, 0.1, 0.75), (0.05, -0.1, 1.0)], np.float32)
+    lights /= np.linalg.norm(lights, axis=1, keepdims=True)
+    drawn = benchmark.comparable(draw_scene(3, 0, CONFIG, corner()))
+    zero = drawn.materials["metallic"].base[:1] * 0
+    metal = replace(
+        drawn.materials["metallic"].take(slice(0, 1)),
+        base=zero + 0.9,
+        metallic=zero + 1,
+        roughness=zero + 0.2,
+        specular=zero + 0.5,
+        sheen=zero,
+    )
+    faces = np.zeros(len(drawn.mesh.faces), np.int64)
+    scene = replace(drawn, lights=lights, materials={"metallic": metal}, patch_of_face=faces)
+    shapes = benchmark.mitsuba_shapes(scene, "metallic")
+    images = [benchmark.render_with_mitsuba(shapes, SIZE, SAMPLES, light) for light in lights]
+    config = replace(CONFIG, samples=3, directions=96)
+    off = {}
+    for sharp in (True, False):
+        ours = render_scene(replace(scene, sharp=sharp), config)
+        theirs = np.concatenate([block_means(image[ours.mask], ours.mask) for image in images])
+        mine = np.concatenate(
+            [block_means(ours.observations["metallic"][:, n], ours.mask) for n in range(3)]
+        )
+        off[sharp] = np.abs(mine - theirs).mean() / theirs.mean()
+    assert off[True] < 0.08
+    assert off[False] > 0.4

@@ -41,9 +41,11 @@ class Matte:
 def _no_lobes(monkeypatch: pytest.MonkeyPatch) -> None:
     """A matte surface has no sharp lobes that the renderer would soften."""
     soften = rendering.soften
-    monkeypatch.setattr(
-        rendering, "soften", lambda found: found if isinstance(found, Matte) else soften(found)
-    )
+
+    def soften_others(found, lowest):
+        return found if isinstance(found, Matte) else soften(found, lowest)
+
+    monkeypatch.setattr(rendering, "soften", soften_others)
 
 
 def matte(reflectance: float) -> dict[str, Matte]:
@@ -110,6 +112,48 @@ def test_a_matte_ball_is_lambert_s_law_and_lights_nothing_of_itself():
     assert np.abs(direct - expected)[well_inside].mean() < 0.002
     indirect = render_indirect(*parts, directions=16, bounces=3, generator=seeded(0))["matte"]
     assert indirect.abs().max() == 0
+
+
+@dataclass(frozen=True)
+class Cosines:
+    """Radiance that tells under which cosines it was shaded: n.v in the first half of the lights,
+    l.v in the second.
+    """
+
+    def take(self, pixels: slice | Tensor) -> Cosines:
+        return self
+
+    def shade(self, n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> Tensor:
+        half = n_dot_l.shape[1] // 2
+        return torch.cat((n_dot_v.expand(-1, half), l_dot_v[:, half:]), dim=1)
+
+
+def test_a_ball_seen_from_a_finite_distance() -> None:
+    radius, distance = 0.8, 4.0
+    tracer = Tracer(ball(radius, polar=90, inward=False))
+    visible = find_visible_surface(tracer, 64, 3, distance=distance)
+    # The cone that touches the ball cuts the plane z = 0 in a circle of the radius d tan(asin(r /
+    # d)).
+    outline = distance * radius / np.sqrt(distance**2 - radius**2)
+    centres = pixel_centres(visible.mask)
+    assert 0.95 * outline < np.hypot(*centres.T).max() < outline
+    # Where the ray from the camera through the middle of a pixel meets the ball
+    rays = np.append(centres, np.zeros((len(centres), 1)), axis=1) - (0, 0, distance)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    along = -distance * rays[:, 2]
+    points = (0, 0, distance) + (along - np.sqrt(along**2 - distance**2 + radius**2))[
+        :, None
+    ] * rays
+    inside = (points * rays).sum(axis=1) < -0.4 * radius
+    off = np.degrees(np.arccos(np.clip((points / radius * visible.normals).sum(axis=1), -1, 1)))
+    assert off[inside].max() < 0.3
+    lights = directions((0, 0, 1), (0.3, 0.2, 0.9), (0, 0, 1), (-0.6, 0.1, 0.8))
+    faces = np.zeros(len(tracer.mesh.faces), np.int64)
+    found = render_direct(tracer, visible, lights, {"cosines": Cosines()}, faces)["cosines"].numpy()
+    expected = np.hstack(
+        (np.tile(-(points / radius * rays).sum(axis=1)[:, None], 2), -rays @ lights[2:].T)
+    )
+    assert np.abs(found - expected)[inside].max() < 0.02
 
 
 def floor_with_wall() -> Mesh:

@@ -21,6 +21,13 @@ from splinecli.maths.observation_map import MAP_SIZE, Grid
 from splinecli.records.base import settings
 
 HEAD_WIDTH = 16  # channels of an attention head of the set branch
+# channels of the refinement net at full, half, quarter and eighth resolution
+REFINE_WIDTHS = (
+    32,
+    64,
+    96,
+    64,
+)
 
 
 STARTING_FITS: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
@@ -60,6 +67,7 @@ def fit_normals(
 
 
 Depth = Annotated[int, Meta(ge=1, le=64)]  # each layer takes memory, whatever its size
+Width = Annotated[int, Meta(ge=1, le=4096)]
 
 
 @dataclass(frozen=True)
@@ -87,6 +95,10 @@ class NetworkConfig:
     # whether a refinement net corrects the map of normals afterwards. Needs an error head.
     refines: bool = False
     refines_twice: bool = False  # whether a second refinement net follows the first
+    # refine_widths, refine_reads_blur, refine_layers: see RefineNet
+    refine_widths: tuple[Width, Width, Width, Width] = REFINE_WIDTHS
+    refine_reads_blur: bool = False
+    refine_layers: Annotated[int, Meta(ge=0, le=64)] = 0
     # channels of the set branch, 0 for none. Compact size only.
     set_width: Annotated[int, Meta(ge=0, le=4096)] = 0
     set_layers: Depth = 3  # attention layers of the set branch
@@ -116,22 +128,29 @@ class NetworkConfig:
                     f"network setting 'fits' has {fit!r};"
                     f" expected a list of {', '.join(STARTING_FITS)}"
                 )
-        for name in ("fits", "error_head", "set_width"):
-            if getattr(config, name) and config.size != "compact":
-                raise ModelError(f"network setting {name!r} needs the size 'compact'")
-        if config.refines and not config.error_head:
-            raise ModelError("network setting 'refines' needs 'error_head'")
-        if config.refines_twice and not config.refines:
-            raise ModelError("network setting 'refines_twice' needs 'refines'")
-        if config.sees_capture and not config.set_width:
-            raise ModelError("network setting 'sees_capture' needs 'set_width' above 0")
-        if config.set_width % HEAD_WIDTH:
-            raise ModelError(
-                f"network setting 'set_width' is {config.set_width};"
-                f" expected a multiple of {HEAD_WIDTH}"
-            )
-        if config.grid != "even" and config.size != "paper":
-            raise ModelError(
-                f"network setting 'grid' is {config.grid!r}; it needs the size 'paper'"
-            )
+        compact_only = ("fits", "error_head", "set_width")
+        wrong = {
+            **{
+                f"{name!r} needs the size 'compact'": getattr(config, name)
+                and config.size != "compact"
+                for name in compact_only
+            },
+            "'refines' needs 'error_head'": config.refines and not config.error_head,
+            "'refines_twice' needs 'refines'": config.refines_twice and not config.refines,
+            f"'refine_layers' needs refine_widths that end with a multiple of {HEAD_WIDTH}": (
+                config.refine_layers and config.refine_widths[-1] % HEAD_WIDTH
+            ),
+            "'sees_capture' needs 'set_width' above 0": (
+                config.sees_capture and not config.set_width
+            ),
+            f"'set_width' is {config.set_width}; expected a multiple of {HEAD_WIDTH}": (
+                config.set_width % HEAD_WIDTH
+            ),
+            f"'grid' is {config.grid!r}; it needs the size 'paper'": (
+                config.grid != "even" and config.size != "paper"
+            ),
+        }
+        for problem, is_wrong in wrong.items():
+            if is_wrong:
+                raise ModelError(f"network setting {problem}")
         return config

@@ -156,7 +156,7 @@ class SetBranch(nn.Module):
         super().__init__()
         self.observation = nn.Linear(6 + 2 * normals, width)
         self.pixel = nn.Linear(3 * normals + 1, width)
-        self.layers = nn.ModuleList(_AttentionLayer(width) for _ in range(layers))
+        self.layers = nn.ModuleList(AttentionLayer(width) for _ in range(layers))
         self.contexts = (
             nn.ModuleList(ContextLayer(width) for _ in range(layers)) if sees_capture else None
         )
@@ -210,20 +210,23 @@ class SetBranch(nn.Module):
         return tokens[:, 0], fitted, CaptureContext(brightness, tuple(found)) if found else None
 
 
-class _AttentionLayer(nn.Module):
+class AttentionLayer(nn.Module):
     """Attention and a perceptron on tokens (P, T, width). Each is preceded by a layer norm and
     added to its input.
+
+    With `starts_idle`, it initially adds nothing.
     """
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, *, starts_idle: bool = False) -> None:
         super().__init__()
         self.heads = width // HEAD_WIDTH
         self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)
         self.queries_keys_values = nn.Linear(width, 3 * width)
         self.attended = nn.Linear(width, width)
-        self.perceptron = nn.Sequential(
-            nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
-        )
+        last = nn.Linear(2 * width, width)
+        self.perceptron = nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), last)
+        if starts_idle:
+            zeroed(self.attended), zeroed(last)
 
     def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
         pixels, count, width = tokens.shape

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from splinecli.recipe import RecipeOptions, prepare_capture
 from splinecli.system.files import file_sha256, free_name, replacing
 from splinecli.system.machine import import_extra
 from splinecli.workshop.pixel_sets.store import ARRAYS, Pixels, PixelSetWriter
+from splinecli.workshop.synthesis.groups import draw_group
 from splinecli.workshop.synthesis.meshes import read_mesh
 from splinecli.workshop.synthesis.scenes import MATERIALS, SceneConfig, draw_scene, render_scene
 from splinecli.workshop.synthesis.shapes import draw_view, read_relief
@@ -117,12 +118,17 @@ def add_capture(
 
 
 # Version of the renderer. Increase it when the result changes, because a set must not mix versions.
-RENDERER = 5
+RENDERER = 6
 
 
 @dataclass(frozen=True, eq=False)
 class ScenePlan:
-    """The scenes to render: first the views of each mesh file, then `count` random scenes."""
+    """The scenes to render: first the views of each mesh file, then `count` random scenes, then
+    `groups`.
+
+    With groups, of which the meshes are a part, there are no scenes of one mesh alone unless
+    `views` is above 0.
+    """
 
     config: SceneConfig
     seed: int
@@ -130,6 +136,7 @@ class ScenePlan:
     meshes: tuple[Path, ...] = ()
     views: int = 0  # random views per mesh, see draw_view; 0 for one view along its +z axis
     reliefs: tuple[Path, ...] = ()  # normal maps, for half of the scenes
+    groups: int = 0  # number of groups of bodies, see draw_group
 
     @cached_property
     def _of_mesh(self) -> tuple[tuple[Path, str, int], ...]:
@@ -143,7 +150,7 @@ class ScenePlan:
             taken.append(free_name(path.stem, taken.__contains__))
         named = [*zip(self.meshes, taken, range(len(taken)), strict=True)]
         if not self.views:
-            return tuple(named)
+            return () if self.groups else tuple(named)
         views = range(self.views)
         return tuple(
             (path, f"{name}-view{n:03}", mesh + 10_000 * n)
@@ -154,10 +161,17 @@ class ScenePlan:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """The names of the scenes."""
-        return (
-            *(name for _, name, _ in self._of_mesh),
-            *(f"scene{index:04}" for index in range(self.count)),
+        scenes = (
+            f"{kind}{n:04}"
+            for kind, count in (("scene", self.count), ("group", self.groups))
+            for n in range(count)
         )
+        return (*(name for _, name, _ in self._of_mesh), *scenes)
+
+    def _config_of(self, position: int) -> SceneConfig:
+        if position < len(self._of_mesh) + self.count:
+            return self.config
+        return replace(self.config, sharp_share=0.5, perspective_share=0.3)
 
     def entry_names(self, position: int) -> dict[str, str]:
         """Return the names of a scene's entries by material."""
@@ -167,11 +181,12 @@ class ScenePlan:
         """Return the values that determine the content of a scene."""
         meshes = self._of_mesh[position : position + 1]
         shapes = [file_sha256(path) for path, _, _ in meshes]
-        if meshes and self.views:  # another mesh may be placed next to it
+        # Another mesh may be placed next to it.
+        if (meshes and self.views) or position >= len(self._of_mesh) + self.count:
             shapes += [file_sha256(path) for path in self.meshes]
         return {
             "renderer": RENDERER,
-            **asdict(self.config),
+            **asdict(self._config_of(position)),
             "seed": self.seed,
             "mesh": shapes or None,
             "views": int(bool(shapes and self.views)),
@@ -214,7 +229,7 @@ class ScenePlan:
         be used, or nothing is visible to the camera; UsageError if the packages of the extra
         `render` are not installed.
         """
-        mesh_file = mesh = None
+        mesh_file = mesh = group = None
         index = position - len(self._of_mesh)
         if index < 0:
             mesh_file, _, number = self._of_mesh[position]
@@ -224,8 +239,22 @@ class ScenePlan:
             if self.views:
                 others = tuple(path for path in self.meshes if path != mesh_file)
                 mesh = draw_view(mesh, others, np.random.default_rng([self.seed, index, 2]))
-        scene = draw_scene(self.seed, index, self.config, mesh, self.reliefs)
-        rendered = render_scene(scene, self.config, progress)
+        elif index >= self.count:
+            # In steps of the golden ratio, so that even a small set has all grades
+            grade = float(
+                (
+                    np.random.default_rng(self.seed).random()
+                    + (index - self.count) * (np.sqrt(5) - 1) / 2
+                )
+                % 1
+            )
+            index += 2_000_000 - self.count
+            group, mesh = draw_group(
+                np.random.default_rng([self.seed, index, 2]), self.meshes, grade
+            )
+        config = self._config_of(position)
+        scene = draw_scene(self.seed, index, config, mesh, self.reliefs)
+        rendered = render_scene(scene, config, progress)
         if not rendered.mask.any():
             raise InputError(
                 "the camera sees nothing of the mesh",
@@ -239,7 +268,7 @@ class ScenePlan:
         observations = {
             kind: values.astype(np.float16) for kind, values in rendered.observations.items()
         }
-        return scene.shape, {
+        return group or scene.shape, {
             kind: Pixels(observations[kind], normals, lights, rendered.mask) for kind in MATERIALS
         }
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from splinecli.maths.observation_map import cell_directions, rotate_about_view_axis, sparse_map
 from splinecli.workshop.pixel_sets.store import Entry, PixelSet
 from splinecli.workshop.synthesis.batches import CaptureConfig, DenseMap, PixelBatch
-from splinecli.workshop.synthesis.lights import draw_light_counts, rank_in_cone
+from splinecli.workshop.synthesis.lights import rank_in_cone
 from splinecli.workshop.synthesis.whole_capture import photograph_captures
 
 FILL_ROUNDS = 3  # each round extends one cell further from the cells with a light
@@ -101,9 +101,7 @@ class PixelSetSource:
         """Draw a batch of P pixels."""
         truth = self._sample(pixels)
         config, captures = self.config, self.config.captures(pixels)
-        counts = draw_light_counts(
-            captures, config.min_lights, config.max_lights, config.usual_lights, self.generator
-        )
+        counts = config.light_counts(captures, self.generator)
         order, valid = self._choose_lights(truth, counts)
         directions = truth.light_directions.gather(1, order[..., None].expand(*order.shape, 3))
         radiance = truth.radiance.gather(1, order)

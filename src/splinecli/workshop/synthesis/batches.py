@@ -19,6 +19,7 @@ from splinecli.images.saturation import restore_saturated
 from splinecli.maths.transfer import decode_transfer
 from splinecli.records.base import Count, Share
 from splinecli.workshop.synthesis import draw_uniform
+from splinecli.workshop.synthesis.lights import draw_light_counts
 
 
 def disturb_light_directions(
@@ -151,10 +152,11 @@ class CaptureConfig:
     disables a fault.
     """
 
-    # min_lights, max_lights, usual_lights: see draw_light_counts
+    # min_lights, max_lights, usual_lights, usual_lights_share: see draw_light_counts
     min_lights: LightCount = 4
     max_lights: LightCount = 96
     usual_lights: LightCount = 10
+    usual_lights_share: Share = 0.5
     # usual number of pixels per capture, which share lights, materials and faults. With 1, each
     # pixel is independent.
     capture_pixels: Count = 1
@@ -175,6 +177,16 @@ class CaptureConfig:
         p % G.
         """
         return max(1, pixels // self.capture_pixels)
+
+    def light_counts(
+        self, captures: int, generator: torch.Generator, *, available: int | None = None
+    ) -> Tensor:
+        """Draw the number of lights of each capture (G,), of at most the `available` lights."""
+        most = self.max_lights if available is None else min(self.max_lights, available)
+        usual, share = min(self.usual_lights, most), self.usual_lights_share
+        return draw_light_counts(
+            captures, self.min_lights, most, usual, generator, usual_share=share
+        )
 
 
 class DenseMap(NamedTuple):

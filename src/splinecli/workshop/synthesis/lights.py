@@ -10,18 +10,26 @@ from splinecli.workshop.synthesis import draw_uniform
 
 
 def draw_light_counts(
-    pixels: int, low: int, high: int, usual: int, generator: torch.Generator
+    pixels: int,
+    low: int,
+    high: int,
+    usual: int,
+    generator: torch.Generator,
+    *,
+    usual_share: float = 0.5,
 ) -> Tensor:
     """Draw the number of lights of each pixel (P,). Within a draw they differ by at most a fifth.
 
-    Each draw has a maximum: for half of the draws it is usual - 1 to usual + 2, else it is
-    log-uniform over low..high. Every pixel has at least four fifths of that number, which keeps the
-    padding small.
+    Each draw has a maximum: for `usual_share` of the draws it is usual - 1 to usual + 2, else it is
+    log-uniform over low..high.
+    Every pixel has at least four fifths of that number, which keeps the padding small.
     """
     anywhere = low * ((high + 1) / low) ** draw_uniform(generator, 1)
     about = usual - 1 + 4 * draw_uniform(generator, 1)
     largest = (
-        torch.where(draw_uniform(generator, 1) < 0.5, about, anywhere).floor().clamp(low, high)
+        torch.where(draw_uniform(generator, 1) < usual_share, about, anywhere)
+        .floor()
+        .clamp(low, high)
     )
     return (largest * (1 - 0.2 * draw_uniform(generator, pixels))).round().long().clamp(low, high)
 

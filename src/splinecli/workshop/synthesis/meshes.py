@@ -201,6 +201,13 @@ def capsule(half_length: float, radius: float) -> Field:
     return distance
 
 
+def polyhedron(normals: Floats, distances: Floats) -> Field:
+    """Return the convex body below planes with unit normals (N, 3), at distances (N,) from the
+    origin.
+    """
+    return lambda points: np.asarray((points @ normals.T - distances).max(axis=1))
+
+
 def moved(field: Field, rotation: Floats, centre: Floats) -> Field:
     """Return the shape, rotated by a matrix and then moved to a centre."""
     return lambda points: field((points - centre) @ rotation)

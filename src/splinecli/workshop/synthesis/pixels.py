@@ -21,7 +21,7 @@ from splinecli.records.base import Share
 from splinecli.workshop.synthesis import draw_uniform
 from splinecli.workshop.synthesis.batches import CaptureConfig, DenseMap, PixelBatch
 from splinecli.workshop.synthesis.draw_materials import choose, draw_material
-from splinecli.workshop.synthesis.lights import draw_light_counts, draw_light_directions
+from splinecli.workshop.synthesis.lights import draw_light_directions
 from splinecli.workshop.synthesis.principled import PrincipledMaterial
 from splinecli.workshop.synthesis.whole_capture import photograph_captures
 
@@ -323,9 +323,7 @@ class PixelGenerator:
         captures = config.captures(pixels)
         size = pixels // captures
         scene = draw_scene(pixels, config, generator)
-        counts = draw_light_counts(
-            captures, config.min_lights, config.max_lights, config.usual_lights, generator
-        )
+        counts = config.light_counts(captures, generator)
         directions = draw_light_directions(captures, int(counts.max()), generator).repeat(
             size, 1, 1
         )

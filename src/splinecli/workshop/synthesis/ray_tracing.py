@@ -1,9 +1,10 @@
 """Ray-mesh intersection by Embree (https://www.embree.org) through embreex, and the surface visible
 to a camera.
 
-embreex is part of the extra `render` and is imported when a Tracer is made. The orthographic camera
-looks along -z at the square [-1, 1]^2. A pixel is the mean of k x k samples on a regular grid. One
-sample at the centre is not enough: on glossy metal its radiance is off by a tenth.
+embreex is part of the extra `render` and is imported when a Tracer is made. The camera looks along
+-z at the square [-1, 1]^2, orthographic or from a finite distance. A pixel is the mean of k x k
+samples on a regular grid. One sample at the centre is not enough: on glossy metal its radiance is
+off by a tenth.
 """
 
 from __future__ import annotations
@@ -137,6 +138,8 @@ class VisibleSurface:
     samples: Hits  # P * S surface points, grouped by pixel
     samples_per_pixel: int  # S
     coverage: Floats  # (P,), share of the pixel that the surface fills; below 1 at its outline
+    # (P * S, 3), unit, towards the camera; None for (0, 0, 1), an orthographic camera
+    back: Floats | None = None
 
     def samples_of(self, pixels: NDArray[np.int64]) -> Hits:
         """Return all samples of some pixels."""
@@ -145,9 +148,17 @@ class VisibleSurface:
 
 
 def find_visible_surface(
-    tracer: Tracer, size: int, samples: int, bend: Callable[[Floats, Floats], Floats] | None = None
+    tracer: Tracer,
+    size: int,
+    samples: int,
+    bend: Callable[[Floats, Floats], Floats] | None = None,
+    *,
+    distance: float = np.inf,
 ) -> VisibleSurface:
     """Trace the camera's rays: size x size pixels of samples x samples samples each.
+
+    At a finite `distance`, the camera is at (0, 0, distance), and the square [-1, 1]^2 is in the
+    plane z = 0.
 
     A pixel is dropped if more than half of its samples miss the surface, or if the surface is at a
     grazing angle. Samples that miss are replaced by other samples of the same pixel. `bend` gives
@@ -162,11 +173,23 @@ def find_visible_surface(
         return grid.reshape(size, samples, size, samples).transpose(0, 2, 1, 3).ravel()
 
     x, y = steps[by_pixel(column)], -steps[by_pixel(row)]
-    top = np.full_like(x, tracer.mesh.vertices[:, 2].max() + 1)
-    rays, hits = tracer.first_hits(
-        np.stack((x, y, top), axis=1), np.array([[0, 0, -1]], dtype=np.float32)
-    )
-    front = hits.normal[:, 2] > 0
+    if orthographic := np.isinf(distance):
+        top = np.full_like(x, tracer.mesh.vertices[:, 2].max() + 1)
+        rays, hits = tracer.first_hits(
+            np.stack((x, y, top), axis=1), np.array([[0, 0, -1]], dtype=np.float32)
+        )
+    else:
+        camera = np.array((0, 0, distance), dtype=np.float32)
+        towards = unit(np.stack((x, y, np.zeros_like(x)), axis=1) - camera)
+        rays, hits = tracer.first_hits(np.tile(camera, (len(x), 1)), towards)
+
+    def facing(normals: Floats, positions: Floats) -> Floats:
+        """Return the cosines (N,) of the normals with the directions to the camera."""
+        return np.asarray(
+            normals[:, 2] if orthographic else (normals * unit(camera - positions)).sum(axis=1)
+        )
+
+    front = facing(hits.normal, hits.position) > 0
     rays, hits = rays[front], hits.take(front)
     if bend is not None:
         hits = replace(hits, normal=bend(hits.normal, hits.position))
@@ -176,10 +199,11 @@ def find_visible_surface(
     first = np.cumsum(found) - found  # row of the first sample of each pixel
     rows = first[seen, None] + np.arange(per_pixel) % found[seen, None]
     normals = unit(hits.normal[rows].mean(axis=1))
-    kept = normals[:, 2] > 0.05  # drop pixels at a more grazing angle
+    # Drop pixels at a more grazing angle.
+    kept = facing(normals, hits.position[rows[:, 0]]) > 0.05
     coverage = (found[seen] / per_pixel).astype(np.float32)
     seen[seen] = kept
     mask = seen.reshape(size, size)
-    return VisibleSurface(
-        mask, normals[kept], hits.take(rows[kept].ravel()), per_pixel, coverage[kept]
-    )
+    shown = hits.take(rows[kept].ravel())
+    back = None if orthographic else unit(camera - shown.position)
+    return VisibleSurface(mask, normals[kept], shown, per_pixel, coverage[kept], back)

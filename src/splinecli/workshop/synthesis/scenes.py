@@ -4,16 +4,17 @@ A scene has one shape, three sets of materials in each of three classes, and dir
 the whole upper hemisphere. Additional materials take little time, because the light paths are the
 same. A scene depends only on (seed, index), so an interrupted set can be continued.
 
-The camera is orthographic. A matte white surface facing the light has radiance 1. Each sample of a
-pixel is shaded with its own interpolated normal. Indirect light is gathered along random paths that
-start at the samples (Kajiya, "The rendering equation", 1986). All lights illuminate each vertex of
-a path at once. Visibility does not depend on the material, so paths and shadows are traced once for
-all materials.
+The camera is orthographic, or at a finite distance. A matte white surface facing the light has
+radiance 1. Each sample of a pixel is shaded with its own interpolated normal. Indirect light is
+gathered along random paths that start at the samples (Kajiya, "The rendering equation", 1986). All
+lights illuminate each vertex of a path at once. Visibility does not depend on the material, so
+paths and shadows are traced once for all materials.
 
 Two approximations reduce noise, because caustics would otherwise appear as single bright pixels.
 First, surfaces that emit or receive indirect light have at least roughness 0.3 (path space
-regularization, Kaplanyan & Dachsbacher 2013). Second, surface points beyond the first use the
-shadows of the nearest vertex.
+regularization, Kaplanyan & Dachsbacher 2013). In scenes with sharp interreflection, the lowest
+roughness is 0.1 instead, except where so few paths would meet the lobe that it is noise. Second,
+surface points beyond the first use the shadows of the nearest vertex.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ from splinecli.workshop.synthesis.ray_tracing import (
 )
 from splinecli.workshop.synthesis.shapes import Relief, draw_detail, draw_shape, read_relief
 
+SOFT = 0.3  # lowest roughness of surfaces that emit or receive indirect light
 # points shaded together: a tensor then takes about a megabyte and stays in the cache
 SHADED_ROWS = 512
 
@@ -68,6 +70,7 @@ def render_direct(
         hits = visible.samples_of(rows)
         normals = torch.from_numpy(hits.normal)
         cosines = normals @ directions.T
+        n_dot_v, l_dot_v = _view_cosines(visible, rows, normals, directions)
         lit = tracer.lit(hits.lifted(), (cosines > 0).numpy(), lights)
         cosines *= torch.from_numpy(lit)
         patches = torch.from_numpy(patch_of_face[hits.triangle])
@@ -77,13 +80,25 @@ def render_direct(
             )
             target = slice(start + first, min(start + first + block, pixels))
             for name, material in materials.items():
-                shaded = material.take(patches[some]).shade(
-                    cosines[some], normals[some, 2:], directions[:, 2]
-                )
+                along = l_dot_v if l_dot_v.ndim == 1 else l_dot_v[some]
+                shaded = material.take(patches[some]).shade(cosines[some], n_dot_v[some], along)
                 shape = (-1, visible.samples_per_pixel, len(lights))
                 torch.mean(shaded.view(shape), dim=1, out=radiance[name][target])
         progress((rows[-1] + 1) / pixels)
     return before_black(radiance, visible)
+
+
+def _view_cosines(
+    visible: VisibleSurface, pixels: NDArray[np.int64], normals: Tensor, directions: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return n.v (N, 1) and l.v, (F) or (N, F), of the samples of some pixels with unit normals (N,
+    3).
+    """
+    if visible.back is None:
+        return normals[:, 2:], directions[:, 2]
+    count = visible.samples_per_pixel
+    back = torch.from_numpy(visible.back[(pixels[:, None] * count + np.arange(count)).ravel()])
+    return (normals * back).sum(-1, keepdim=True).clamp(min=0.01), back @ directions.T
 
 
 def before_black(radiance: dict[str, Tensor], visible: VisibleSurface) -> dict[str, Tensor]:
@@ -100,11 +115,44 @@ class _Vertices:
     back: Tensor  # (N, 3), unit directions to the previous vertex
     pixel: Tensor  # (N,), the pixel of the path
     patches: Tensor  # (N,), the patch of the surface
+    # (N, 1), the density per steradian with which the direction to the vertex was drawn
+    density: Tensor
 
     def take(self, rows: Tensor) -> _Vertices:
         kept = rows.numpy()
-        return _Vertices(
-            self.hits.take(kept), self.back[rows], self.pixel[rows], self.patches[rows]
+        others = (self.back, self.pixel, self.patches, self.density)
+        return _Vertices(self.hits.take(kept), *(values[rows] for values in others))
+
+
+@dataclass(frozen=True)
+class _Sharpness:
+    """How sharp the lobes of surfaces are that emit or receive indirect light."""
+
+    lowest: float  # roughness
+    paths: int  # per pixel
+    lobes: tuple[float, ...]  # of the drawn directions
+
+    def soften(
+        self, material: PrincipledMaterial, vertices: _Vertices, rows: slice | Tensor
+    ) -> PrincipledMaterial:
+        """Return the materials of some of the vertices, softened.
+
+        A lobe of roughness r reflects a light into about 4 pi r^4 steradians. Paths with an
+        expected number of less than one in it make a blunter lobe.
+        """
+        if self.lowest >= SOFT:
+            floor: float | Tensor = SOFT
+        else:
+            lone = (1 / (4 * math.pi * self.paths * vertices.density[rows])) ** 0.25
+            floor = lone.clamp(min=self.lowest, max=SOFT)
+        return soften(material.take(vertices.patches[rows]), floor)
+
+    def most(self, vertices: _Vertices, rows: slice) -> float | Tensor:
+        """Return the largest contribution of one path, relative to its expected share. Larger
+        values are noise.
+        """
+        return (
+            8.0 if self.lowest >= SOFT else 64 * (2 * math.pi * vertices.density[rows]).clamp(min=1)
         )
 
 
@@ -118,6 +166,7 @@ def render_indirect(  # noqa: PLR0913 - the parts of a scene, and how it is trac
     directions: int,
     bounces: int,
     generator: torch.Generator,
+    lowest_roughness: float = SOFT,
     progress: Progress = lambda _: None,
 ) -> dict[str, Tensor]:
     """Return radiances (P, F) of each material from light that was reflected 1 to `bounces` times
@@ -127,7 +176,9 @@ def render_indirect(  # noqa: PLR0913 - the parts of a scene, and how it is trac
     paths per pixel.
     """
     pixels = len(visible.normals)
-    soft = {name: soften(material) for name, material in materials.items()}
+    sharpness = _Sharpness(
+        lowest_roughness, directions, LOBES if lowest_roughness >= SOFT else SHARP_LOBES
+    )
     radiance = {name: torch.zeros(pixels, len(lights)) for name in materials}
     shadows = ShadowCache(tracer, lights)
     at_once = max(1, 8 * TRACED_ROWS // directions)
@@ -136,22 +187,25 @@ def render_indirect(  # noqa: PLR0913 - the parts of a scene, and how it is trac
         ordinal = torch.arange(directions).repeat(len(rows))
         pixel = rows.repeat_interleave(directions)
         # Each sample gets directions from all lobes.
-        turn = torch.div(ordinal, len(LOBES), rounding_mode="floor")
+        turn = torch.div(ordinal, len(sharpness.lobes), rounding_mode="floor")
         sample = pixel * visible.samples_per_pixel + turn % visible.samples_per_pixel
         hits = visible.samples.take(sample.numpy())
-        towards_camera = torch.tensor([[0.0, 0.0, 1.0]]).expand(len(pixel), 3)
+        back = torch.tensor([[0.0, 0.0, 1.0]]).expand(len(pixel), 3)
+        if visible.back is not None:
+            back = torch.from_numpy(visible.back[sample.numpy()])
         patches = torch.from_numpy(patch_of_face[hits.triangle])
-        vertices = _Vertices(hits, towards_camera, pixel, patches)
+        vertices = _Vertices(hits, back, pixel, patches, torch.full((len(pixel), 1), torch.inf))
         shift = torch.rand(len(rows), 2, generator=generator).repeat_interleave(directions, dim=0)
         weights = {name: torch.full((len(pixel), 1), 1 / directions) for name in materials}
         for bounce in range(bounces):
             if bounce:
                 ordinal = torch.randint(0, 1 << 16, (len(vertices.pixel),), generator=generator)
                 shift = torch.rand(len(vertices.pixel), 2, generator=generator)
-            vertices, weights = _extend(
-                tracer, vertices, weights, soft, patch_of_face, ordinal, shift
+            parts = weights, materials, sharpness
+            vertices, weights = _extend(tracer, vertices, *parts, patch_of_face, ordinal, shift)
+            _gather(
+                vertices, weights, materials, sharpness, torch.from_numpy(lights), shadows, radiance
             )
-            _gather(vertices, weights, soft, torch.from_numpy(lights), shadows, radiance)
             # Russian roulette: a path survives with its remaining weight in the brightest material
             # as probability.
             chance = (
@@ -168,23 +222,22 @@ def render_indirect(  # noqa: PLR0913 - the parts of a scene, and how it is trac
     return before_black(radiance, visible)
 
 
-def soften(material: PrincipledMaterial) -> PrincipledMaterial:
-    """Return the reflectance without its sharpest lobes, for surfaces that illuminate other
-    surfaces.
-    """
+def soften(material: PrincipledMaterial, lowest: float | Tensor) -> PrincipledMaterial:
+    """Return the reflectance without lobes below a roughness, a number or (P, 1)."""
     return replace(
         material,
-        roughness=material.roughness.clamp(min=0.3),
-        second_roughness=material.second_roughness.clamp(min=0.3),
+        roughness=material.roughness.clamp(min=lowest),
+        second_roughness=material.second_roughness.clamp(min=lowest),
         clearcoat_gloss=torch.zeros_like(material.clearcoat_gloss),
     )
 
 
-def _extend(
+def _extend(  # noqa: PLR0913 - the parts of a scene
     tracer: Tracer,
     vertices: _Vertices,
     weights: dict[str, Tensor],
     materials: Materials,
+    sharpness: _Sharpness,
     patch_of_face: NDArray[np.int64],
     ordinal: Tensor,
     shift: Tensor,
@@ -193,7 +246,7 @@ def _extend(
     those paths.
     """
     normals = torch.from_numpy(vertices.hits.normal)
-    direction, density = draw_directions(normals, vertices.back, ordinal, shift)
+    direction, density = draw_directions(normals, vertices.back, ordinal, shift, sharpness.lobes)
     n_dot_w = (normals * direction).sum(-1, keepdim=True)
     above = (n_dot_w[:, 0] > 0).nonzero()[:, 0]
     rays, hits = tracer.first_hits(vertices.hits.lifted()[above.numpy()], direction[above].numpy())
@@ -207,17 +260,22 @@ def _extend(
     w_dot_v = (direction[rows] * met.back).sum(-1, keepdim=True)
     onward = {}
     for name, material in materials.items():
-        reflected = material.take(met.patches).shade(cosines[0], cosines[1], w_dot_v)
+        reflected = sharpness.soften(material, met, slice(None)).shade(
+            cosines[0], cosines[1], w_dot_v
+        )
         share = reflected / (np.pi * density[rows].clamp(min=1e-6))
         onward[name] = weights[name][rows] * share.clamp(max=8.0)
     patches = torch.from_numpy(patch_of_face[hits.triangle])
-    return _Vertices(hits, -direction[rows], met.pixel, patches), onward
+    return _Vertices(
+        hits, -direction[rows], met.pixel, patches, density[rows].clamp(min=1e-6)
+    ), onward
 
 
 def _gather(
     vertices: _Vertices,
     weights: dict[str, Tensor],
     materials: Materials,
+    sharpness: _Sharpness,
     lights: Tensor,
     shadows: ShadowCache,
     radiance: dict[str, Tensor],
@@ -234,20 +292,22 @@ def _gather(
         # Vertices are grouped by pixel, so a product with few rows sums them.
         pixels, place = torch.unique_consecutive(vertices.pixel[some], return_inverse=True)
         for name, material in materials.items():
-            shaded = material.take(vertices.patches[some]).shade(cosines, n_dot_v, l_dot_v)
+            shaded = sharpness.soften(material, vertices, some).shade(cosines, n_dot_v, l_dot_v)
             spread = torch.zeros(len(pixels), len(place))
             spread[place, torch.arange(len(place))] = weights[name][some, 0]
-            # Limit the contribution of one path, relative to its expected share. Larger values are
-            # only noise.
-            radiance[name][pixels] += spread @ shaded.clamp(max=8.0)
+            radiance[name][pixels] += spread @ shaded.clamp(max=sharpness.most(vertices, some))
 
 
 LOBES = (0.0, 0.1, 0.0, 0.35)
 """Widths (roughness squared) of the lobes of four successive directions; 0 is the cosine lobe."""
 
 
+SHARP_LOBES = (0.0, 0.1, 0.015, 0.35)
+"""The same for sharp interreflection."""
+
+
 def draw_directions(
-    normals: Tensor, back: Tensor, first: Tensor, shift: Tensor
+    normals: Tensor, back: Tensor, first: Tensor, shift: Tensor, lobes: Sequence[float] = LOBES
 ) -> tuple[Tensor, Tensor]:
     """Draw directions (N, 3) and return them with their densities (N, 1). Some may be below the
     horizon.
@@ -257,17 +317,17 @@ def draw_directions(
     the point of the R2 sequence (Roberts 2018), which covers the lobe evenly. `shift` (N, 2) is the
     offset of the pixel in the sequence.
     """
-    ordinal = torch.div(first, len(LOBES), rounding_mode="floor")
+    ordinal = torch.div(first, len(lobes), rounding_mode="floor")
     u = (shift[:, 0] + ordinal * 0.7548776662466927) % 1.0
     v = (shift[:, 1] + ordinal * 0.5698402909980532) % 1.0
     tangent, bitangent = basis(normals)
     local_view = torch.stack(
         [(back * axis).sum(-1) for axis in (tangent, bitangent, normals)], dim=1
     )
-    lobe = first % len(LOBES)
+    lobe = first % len(lobes)
     # Lobes of the same kind use different parts of the sequence.
     u = (u + lobe * 0.25) % 1.0
-    alpha = torch.tensor(LOBES)[lobe][:, None]
+    alpha = torch.tensor(lobes)[lobe][:, None]
     radius, angle = u.sqrt(), 2 * math.pi * v
     matte = torch.stack((radius * angle.cos(), radius * angle.sin(), (1 - u).sqrt()), dim=1)
     half = _visible_normal(local_view, alpha.clamp(min=0.01), u, v)
@@ -275,22 +335,24 @@ def draw_directions(
     local = torch.where(alpha == 0, matte, mirrored)
     world = local[:, :1] * tangent + local[:, 1:2] * bitangent + local[:, 2:] * normals
     return world, density(
-        local[:, 2:], local_view[:, 2:], (local * local_view).sum(-1, keepdim=True)
+        local[:, 2:], local_view[:, 2:], (local * local_view).sum(-1, keepdim=True), lobes
     )
 
 
-def density(n_dot_w: Tensor, n_dot_v: Tensor, w_dot_v: Tensor) -> Tensor:
+def density(
+    n_dot_w: Tensor, n_dot_v: Tensor, w_dot_v: Tensor, lobes: Sequence[float] = LOBES
+) -> Tensor:
     """Return the density of the mixture per steradian, from cosines of the same shape."""
     half_length = (2 * (1 + w_dot_v)).clamp(min=1e-6).sqrt()
     n_dot_h = ((n_dot_w + n_dot_v) / half_length).clamp(0, 1)
-    total = LOBES.count(0.0) * n_dot_w.clamp(min=0) / math.pi
-    for alpha in LOBES:
+    total = lobes.count(0.0) * n_dot_w.clamp(min=0) / math.pi
+    for alpha in lobes:
         if alpha:
             squared = alpha * alpha
             spread = n_dot_h * n_dot_h * (squared - 1) + 1
             visible = 2 / (n_dot_v + (squared + (1 - squared) * n_dot_v * n_dot_v).sqrt())
             total = total + squared / (math.pi * spread * spread) * visible / 4
-    return total / len(LOBES)
+    return total / len(lobes)
 
 
 def basis(normals: Tensor) -> tuple[Tensor, Tensor]:
@@ -349,6 +411,10 @@ class SceneConfig:
     directions: int = 96  # number of paths per pixel for indirect light
     # largest number of reflections before the visible surface; 0 for direct light only
     bounces: int = 4
+    # sharp_share, perspective_share: shares of the scenes with sharp interreflection, along twice
+    # as many paths, and of those with a camera at a finite distance; see draw_scene
+    sharp_share: float = 0.0
+    perspective_share: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -363,6 +429,9 @@ class Scene:
     patch_of_face: NDArray[np.int64]  # (T,), the patch of each face
     seed: int  # seed of the paths of indirect light
     relief: Relief | None = None  # on the surface
+    sharp: bool = False  # whether interreflection is sharp
+    # of the camera, in halves of the frame's width; infinite for an orthographic one
+    distance: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -390,8 +459,9 @@ def draw_scene(
 
     The surface has one patch in 60 % of the scenes, as real objects have one or few materials, 2 to
     12 in 25 %, and 20 to 3,000 in 15 %. In half of the scenes the patches differ only in their base
-    colour, as on a painted or printed object of uniform gloss. Raises UsageError if the extra
-    `render` is not installed.
+    colour, as on a painted or printed object of uniform gloss. A camera at a finite distance is 1 /
+    U(0.02, 0.25) halves of the frame's width away, and at least a frame's width from the shape: at
+    0.25, the frame is 28 degrees wide. Raises UsageError if the extra `render` is not installed.
     """
     rng = np.random.default_rng([seed, index])
     lights = draw_lights(config.lights, rng)
@@ -417,7 +487,14 @@ def draw_scene(
         relief = draw_detail(
             read_relief(reliefs[int(own.integers(len(reliefs)))]), config.size, own
         )
-    return Scene(shape, mesh, lights, materials, patch_of_face, render_seed, relief)
+    optional = np.random.default_rng([seed, index, 3])
+    sharp = optional.random() < config.sharp_share
+    distance = math.inf
+    if optional.random() < config.perspective_share:
+        distance = max(1 / optional.uniform(0.02, 0.25), float(mesh.vertices[:, 2].max()) + 2)
+    return Scene(
+        shape, mesh, lights, materials, patch_of_face, render_seed, relief, sharp, distance
+    )
 
 
 def render_scene(
@@ -430,8 +507,9 @@ def render_scene(
     """
     report = progress or (lambda _: None)
     tracer = Tracer(scene.mesh)
+    bend = None if scene.relief is None else scene.relief.bend
     visible = find_visible_surface(
-        tracer, config.size, config.samples, None if scene.relief is None else scene.relief.bend
+        tracer, config.size, config.samples, bend, distance=scene.distance
     )
     parts = tracer, visible, scene.lights, scene.materials, scene.patch_of_face
     with torch.inference_mode():
@@ -439,7 +517,8 @@ def render_scene(
         if config.bounces and len(visible.normals):
             indirect = render_indirect(
                 *parts,
-                directions=config.directions,
+                directions=config.directions * (2 if scene.sharp else 1),
+                lowest_roughness=0.1 if scene.sharp else SOFT,
                 bounces=config.bounces,
                 generator=torch.Generator().manual_seed(scene.seed),
                 progress=lambda share: report(0.4 + 0.6 * share),

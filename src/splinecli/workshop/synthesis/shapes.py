@@ -89,15 +89,20 @@ def draw_view(mesh: Mesh, others: Sequence[Path], rng: np.random.Generator) -> M
         mesh = _touching(
             mesh, turn(read_mesh(others[int(rng.integers(len(others)))]), draw_rotation(rng)), rng
         )
-    mesh = fit_to_frame(mesh)
-    if rng.random() < 0.5:
-        # A view is magnified by up to this factor.
-        enlarged, middle = rng.uniform(1, 2.2), mesh.vertices[rng.integers(len(mesh.vertices)), :2]
-        shift = np.append(middle * (1 - enlarged), 0)
-        mesh = Mesh(
-            (mesh.vertices * enlarged + shift).astype(np.float32), mesh.faces, mesh.vertex_normals
-        )
-    return split_long_edges(mesh, longest=LONGEST_EDGE)
+    return split_long_edges(magnified(fit_to_frame(mesh), rng), longest=LONGEST_EDGE)
+
+
+def magnified(mesh: Mesh, rng: np.random.Generator) -> Mesh:
+    """Return the mesh or, in half of the cases, a part of it: enlarged by U(1, 2.2) around a point
+    on the surface.
+    """
+    if rng.random() >= 0.5:
+        return mesh
+    enlarged, middle = rng.uniform(1, 2.2), mesh.vertices[rng.integers(len(mesh.vertices)), :2]
+    shift = np.append(middle * (1 - enlarged), 0)
+    return Mesh(
+        (mesh.vertices * enlarged + shift).astype(np.float32), mesh.faces, mesh.vertex_normals
+    )
 
 
 def _touching(mesh: Mesh, other: Mesh, rng: np.random.Generator) -> Mesh:
@@ -113,14 +118,22 @@ def _touching(mesh: Mesh, other: Mesh, rng: np.random.Generator) -> Mesh:
         - (vertices @ direction).min()
         - rng.uniform(0, 0.4) * depth
     )
+    return joined(mesh, other, vertices + apart * direction)
+
+
+def joined(mesh: Mesh, other: Mesh, vertices: Floats) -> Mesh:
+    """Return both meshes as one, with other vertices for the second."""
     return Mesh(
-        np.concatenate((mesh.vertices, vertices + apart * direction)).astype(np.float32),
+        np.concatenate((mesh.vertices, vertices)).astype(np.float32),
         np.concatenate((mesh.faces, other.faces + len(mesh.vertices))).astype(np.int32),
         np.concatenate((mesh.vertex_normals, other.vertex_normals)),
     )
 
 
-def _draw_solid(rng: np.random.Generator, size: float) -> meshes.Field:
+def draw_solid(rng: np.random.Generator, size: float) -> meshes.Field:
+    """Draw an ellipsoid, a rounded box, a torus or a rod around the origin, with a radius of about
+    `size`.
+    """
     kind = rng.integers(4)
     if kind == 0:
         return meshes.ellipsoid((size * rng.uniform(0.45, 1.3, 3)).astype(np.float32))
@@ -131,7 +144,8 @@ def _draw_solid(rng: np.random.Generator, size: float) -> meshes.Field:
     return meshes.capsule(size * rng.uniform(0.6, 1.6), size * rng.uniform(0.25, 0.5))
 
 
-def _place(field: meshes.Field, rng: np.random.Generator, reach: Range) -> meshes.Field:
+def place_solid(field: meshes.Field, rng: np.random.Generator, reach: Range) -> meshes.Field:
+    """Rotate a solid at random and move it in a random direction, by a distance within `reach`."""
     direction = rng.normal(size=3)
     centre = direction / np.linalg.norm(direction) * rng.uniform(*reach)
     return meshes.moved(field, draw_rotation(rng), centre.astype(np.float32))
@@ -140,7 +154,7 @@ def _place(field: meshes.Field, rng: np.random.Generator, reach: Range) -> meshe
 Range = tuple[float, float]
 
 
-def _draw_waves(
+def draw_waves(
     rng: np.random.Generator,
     frequencies: Range,
     slopes: Range,
@@ -157,7 +171,7 @@ def _draw_waves(
     return lambda points: height * noise(points)
 
 
-_draw_folds = partial(_draw_waves, ridged=True)
+draw_folds = partial(draw_waves, ridged=True)
 
 
 def draw_carved(rng: np.random.Generator) -> Mesh | None:
@@ -165,16 +179,16 @@ def draw_carved(rng: np.random.Generator) -> Mesh | None:
     folds.
     """
     solids = [
-        _place(_draw_solid(rng, rng.uniform(0.25, 0.5)), rng, (0.0, 0.5))
+        place_solid(draw_solid(rng, rng.uniform(0.25, 0.5)), rng, (0.0, 0.5))
         for _ in range(rng.integers(3, 8))
     ]
     tools = [
-        _place(_draw_solid(rng, rng.uniform(0.12, 0.35)), rng, (0.15, 0.7))
+        place_solid(draw_solid(rng, rng.uniform(0.12, 0.35)), rng, (0.15, 0.7))
         for _ in range(rng.integers(3, 9))
     ]
     blend, seam = rng.uniform(0.05, 0.25), rng.uniform(0.02, 0.08)
-    bend = _draw_waves(rng, (0.4, 0.9), (0.1, 0.5), outputs=3)
-    folds = _draw_folds(rng, (0.9, 2.2), (0.2, 0.8)) if rng.random() < 0.55 else None
+    bend = draw_waves(rng, (0.4, 0.9), (0.1, 0.5), outputs=3)
+    folds = draw_folds(rng, (0.9, 2.2), (0.2, 0.8)) if rng.random() < 0.55 else None
 
     def distance(points: Floats) -> Floats:
         bent = points + bend(points)
@@ -191,12 +205,12 @@ def draw_carved(rng: np.random.Generator) -> Mesh | None:
 
 def draw_rough(rng: np.random.Generator) -> Mesh | None:
     """Draw a sphere with smooth or ridged noise, often with craters."""
-    swell = _draw_waves(rng, (0.5, 1.2), (0.3, 0.9))
-    drawn = _draw_folds if rng.random() < 0.6 else _draw_waves
+    swell = draw_waves(rng, (0.5, 1.2), (0.3, 0.9))
+    drawn = draw_folds if rng.random() < 0.6 else draw_waves
     detail = drawn(rng, (1.2, 2.4), (0.2, 0.7))
-    bend = _draw_waves(rng, (0.5, 1.2), (0.0, 0.4), outputs=3)
+    bend = draw_waves(rng, (0.5, 1.2), (0.0, 0.4), outputs=3)
     craters = [
-        _place(
+        place_solid(
             meshes.ellipsoid(
                 (rng.uniform(0.12, 0.4) * rng.uniform(0.6, 1.2, 3)).astype(np.float32)
             ),
@@ -220,13 +234,10 @@ def draw_rough(rng: np.random.Generator) -> Mesh | None:
 
 def draw_relief(rng: np.random.Generator) -> Mesh | None:
     """Draw a slab that fills the frame, folded into ridges, valleys and overhangs."""
-    swell, folds = (
-        _draw_waves(rng, (0.4, 0.9), (0.2, 0.6)),
-        _draw_folds(rng, (0.45, 1.2), (0.4, 1.3)),
-    )
-    bend = _draw_waves(rng, (0.5, 1.2), (0.0, 0.5), outputs=3)
+    swell, folds = draw_waves(rng, (0.4, 0.9), (0.2, 0.6)), draw_folds(rng, (0.45, 1.2), (0.4, 1.3))
+    bend = draw_waves(rng, (0.5, 1.2), (0.0, 0.5), outputs=3)
     pits = [
-        _place(_draw_solid(rng, rng.uniform(0.1, 0.35)), rng, (0.1, 1.0))
+        place_solid(draw_solid(rng, rng.uniform(0.1, 0.35)), rng, (0.1, 1.0))
         for _ in range(rng.integers(0, 6))
     ]
     slab = meshes.box(np.array((1.06, 1.06, 0.8), dtype=np.float32), 0.01)
@@ -243,10 +254,8 @@ def draw_relief(rng: np.random.Generator) -> Mesh | None:
     return meshes.triangulate(distance, (1.09, 1.09, 0.85), SPACING)
 
 
-def draw_vessel(rng: np.random.Generator) -> Mesh | None:
-    """Draw a bowl, cup or vase, round or fluted, tilted by up to 55 degrees. Up to half get further
-    solids.
-    """
+def draw_vessel(rng: np.random.Generator, most_tilt_deg: float = 55) -> Mesh | None:
+    """Draw a bowl, cup or vase, round or fluted, and tilt it. Up to half get further solids."""
     from scipy.spatial.transform import Rotation
 
     half_height = rng.uniform(0.3, 0.75)
@@ -254,9 +263,9 @@ def draw_vessel(rng: np.random.Generator) -> Mesh | None:
     profile = _draw_profile(rng)
     flutes, twist = int(rng.integers(3, 13)), rng.uniform(-2, 2)
     depth = rng.uniform(0.1, 0.5) / flutes if rng.random() < 0.5 else 0.0
-    folds = _draw_folds(rng, (0.8, 2.0), (0.1, 0.4)) if rng.random() < 0.5 else None
+    folds = draw_folds(rng, (0.8, 2.0), (0.1, 0.4)) if rng.random() < 0.5 else None
     extras = [
-        _place(_draw_solid(rng, rng.uniform(0.1, 0.25)), rng, (0.2, 0.6))
+        place_solid(draw_solid(rng, rng.uniform(0.1, 0.25)), rng, (0.2, 0.6))
         for _ in range(rng.integers(0, 4))
     ]
     if rng.random() < 0.5:
@@ -279,7 +288,7 @@ def draw_vessel(rng: np.random.Generator) -> Mesh | None:
     mesh = meshes.triangulate(distance, (1.15, 1.15, half_height + 0.2), SPACING)
     if mesh is None:
         return None
-    tilt, azimuth = np.radians(55) * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
+    tilt, azimuth = np.radians(most_tilt_deg) * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
     towards_azimuth = tilt * np.array((-np.sin(azimuth), np.cos(azimuth), 0))
     return fit_to_frame(
         turn(mesh, Rotation.from_rotvec(towards_azimuth).as_matrix().astype(np.float32))

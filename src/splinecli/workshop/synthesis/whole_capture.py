@@ -16,6 +16,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -292,7 +293,7 @@ def photograph_captures(
     own = torch.Generator().manual_seed(seed)
     for capture in range(captures):
         rows, lights = slice(capture, None, captures), slice(0, int(valid[capture].sum()))
-        seen, found, factor = photograph_scene(
+        seen, found, factor, _ = photograph_scene(
             radiance[rows, lights].cpu(), directions[capture, lights].cpu(), config, own
         )
         observations[rows, lights], calibrated[rows, lights] = (
@@ -303,19 +304,27 @@ def photograph_captures(
     return PixelBatch(observations, calibrated, valid, truth, exposure, captures)
 
 
-def photograph_scene(
+class Photographs(NamedTuple):
+    """One capture of a scene."""
+
+    observations: Tensor  # (P, F), divided by the intensities
+    light_directions: Tensor  # (F, 3), unit, as calibrated
+    exposure: float  # the factor from the radiance to the observations
+    removed_blur: float | None  # see remove_blur
+
+
+def photograph_scene(  # noqa: PLR0915 - one fault after the other, as in a camera
     radiance: Tensor,
     directions: Tensor,
     config: CaptureConfig,
     generator: torch.Generator,
     mask: Tensor | None = None,
-) -> tuple[Tensor, Tensor, float]:
+) -> Photographs:
     """Photograph radiance (P, F) under unit directions (F, 3) with faults that the whole capture
     shares.
 
-    Returns observations (P, F), divided by the intensities, calibrated directions (F, 3), and the
-    factor from the radiance to the observations. With a mask (H, W), the radiance (H * W, F) is of
-    whole images with a background, and the observations are of the mask's pixels.
+    With a mask (H, W), the radiance (H * W, F) is of whole images with a background, and the
+    observations are of the mask's pixels.
 
     Ambient light adds to all images a share 10^U(-3.2, -1) of the pixel's mean radiance over the
     lights, as from room light, and of the capture's mean, as from lens glare; see `_ambient`.
@@ -384,9 +393,10 @@ def photograph_scene(
     if uniform() < 0.3 * config.light_intensity_error_share:
         errors = errors * 2 ** (uniform(0, 0.5) * torch.randn(1, lights, generator=generator))
     observed = exposed * errors / intensities
+    removed = None
     if mask is not None and around is not None:
         values = observed.contiguous().numpy()
-        remove_blur(values, mask.numpy(), around.numpy())
+        removed = remove_blur(values, mask.numpy(), around.numpy())
         pixels = slice(0, int(mask.sum()))
         observed, clipped = torch.from_numpy(values)[pixels], clipped[pixels]
     calibrated = batches.disturb_light_directions(
@@ -396,7 +406,7 @@ def photograph_scene(
         values = observed.contiguous().numpy()
         restore_saturated(values, clipped.numpy(), calibrated.double().numpy())
         observed = torch.from_numpy(values)
-    return observed.contiguous(), calibrated, exposure
+    return Photographs(observed.contiguous(), calibrated, exposure, removed)
 
 
 def _ambient(radiance: Tensor, share: float, uniform: Callable[..., float]) -> Tensor:

@@ -72,6 +72,9 @@ class TrainingConfig:
     # weight of the error of the differences between neighbours beside the angle, for the refinement
     # nets
     detail_weight: NotNegative = 1.0
+    # additional weight of a pixel for the refinement nets, times the largest difference of its
+    # normal to a neighbour's
+    edge_weight: NotNegative = 0.0
     # symmetric_weight, asymmetric_weight: lambda_s and lambda_a, the weights of Ls and La
     symmetric_weight: NotNegative = 0.0
     asymmetric_weight: NotNegative = 0.0
@@ -170,13 +173,19 @@ def _pixels(values: dict[str, Any]) -> PixelGeneratorConfig:
 _COMPACT = NetworkConfig(
     map_size=16, fits=("ls", "iw12", "iw12-all", "ia14"), set_width=64, sees_capture=True
 )
+# As many captures with many lights as with few, and as many with 8 bits as strangers have
+_CAMERAS: dict[str, Any] = {"usual_lights_share": 0.0, "eight_bit_share": 0.4}
 
 PRESETS = {
     "compact": TrainingConfig(
-        network=_COMPACT, pixels=PixelGeneratorConfig(capture_pixels=64), batch_size=512, shards=2
+        network=_COMPACT,
+        pixels=PixelGeneratorConfig(capture_pixels=64, **_CAMERAS),
+        batch_size=512,
+        shards=2,
     ),
     "refine": TrainingConfig(
         network=replace(_COMPACT, error_head=True, refines=True, refines_twice=True),
+        pixels=PixelGeneratorConfig(**_CAMERAS),
         start_from="spline-net",
         updates="refine_net",
         batch_size=4,

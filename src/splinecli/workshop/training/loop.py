@@ -16,7 +16,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
@@ -167,14 +169,20 @@ def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
     )
 
 
-def _start_from(weights: str, network: SplineNet) -> None:
+def start_network(weights: str, network: SplineNet) -> None:
     """Copy the weights into the network, which may have an error head, refinement nets or context
     that they lack.
+
+    Refinement nets may also be larger than those of the weights. Their result is initially the
+    same.
     """
     loaded = resolve_weights(weights).network
     wanted, found = network.config.to_dict(), loaded.config.to_dict()
     for name in wanted:
         added = name in ("sees_capture", "refines_twice") and wanted[name]
+        added |= name.startswith("refine_") and (
+            not found["refines"] or _covers(wanted[name], found[name])
+        )
         if wanted[name] != found[name] and name not in ("error_head", "refines") and not added:
             problem = f"with {name} = {found[name]!r}, the run's has {wanted[name]!r}"
             raise ModelError(
@@ -190,7 +198,36 @@ def _start_from(weights: str, network: SplineNet) -> None:
             " one",
             hint="Train the first one with --param network.refines_twice=false",
         )
-    network.load_state_dict(loaded.state_dict(), strict=False)
+    own = network.state_dict()
+    network.load_state_dict(
+        {
+            name: enlarged(values, own[name])
+            for name, values in loaded.state_dict().items()
+            if name in own
+        },
+        strict=False,
+    )
+
+
+def _covers(wanted: Any, found: Any) -> bool:
+    """Return whether a setting of the refinement nets, a number or several, is nowhere smaller than
+    another one.
+    """
+    return all(one >= other for one, other in zip(np.ravel(wanted), np.ravel(found), strict=True))
+
+
+def enlarged(values: Tensor, initial: Tensor) -> Tensor:
+    """Return the initial weights of a layer (D, C, ...) that is at least as large as another one,
+    which it contains.
+
+    The outputs of the other layer do not depend on the added inputs.
+    """
+    if values.shape == initial.shape:
+        return values
+    larger = initial.clone()
+    larger[: len(values)] = 0
+    larger[tuple(map(slice, values.shape))] = values.to(larger)
+    return larger
 
 
 class Trainer:
@@ -229,7 +266,7 @@ class Trainer:
         torch.manual_seed(config.seed)
         self.network = SplineNet(config.network).to(device)
         if config.start_from and not resume:
-            _start_from(config.start_from, self.network)
+            start_network(config.start_from, self.network)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).eval().requires_grad_(False)
         self.optimizer = torch.optim.AdamW(

@@ -31,11 +31,7 @@ from splinecli.lights.lighting import IndirectLight, PixelIndices, PixelLighting
 from splinecli.workshop.pixel_sets.store import Entry, PixelSet
 from splinecli.workshop.synthesis import stream_seed
 from splinecli.workshop.synthesis.batches import CaptureConfig
-from splinecli.workshop.synthesis.lights import (
-    choose_in_cone,
-    draw_light_counts,
-    draw_light_directions,
-)
+from splinecli.workshop.synthesis.lights import choose_in_cone, draw_light_directions
 from splinecli.workshop.synthesis.whole_capture import (
     add_background,
     draw_engraved,
@@ -58,7 +54,7 @@ _ENLARGED_SHARE, _BACKGROUND_SHARE, _ENGRAVED_SHARE = 0.3, 0.35, 0.4
 class SceneMaps(NamedTuple):
     """One capture of a rendered scene, after SPLINE-Net."""
 
-    features: Tensor  # (CHANNELS, H, W) float16, see refine_features; zero outside the mask
+    features: Tensor  # (FEATURE_CHANNELS, H, W) float16, see refine_features; zero outside the mask
     normals: Tensor  # (3, H, W) float16, ground truth; zero where unknown
     mask: Tensor  # (1, H, W) bool
 
@@ -112,10 +108,7 @@ class ScenePool:
         """Draw a part of a scene, or an engraved piece, and the lights of its capture."""
         config = self.config
         if float(torch.rand((), generator=generator)) < engraved_share:
-            count = draw_light_counts(
-                1, config.min_lights, config.max_lights, config.usual_lights, generator
-            )
-            lights = draw_light_directions(1, int(count), generator)[0]
+            lights = draw_light_directions(1, int(config.light_counts(1, generator)), generator)[0]
             truth, radiance, mask = draw_engraved(80, lights, generator)
             return Scene(_placed(torch.cat((radiance, truth), dim=1), mask), lights, mask)
         weights = torch.tensor([weight for _, _, weight in self.scenes])
@@ -123,11 +116,8 @@ class ScenePool:
         entry = entries[int(torch.randint(len(entries), (), generator=generator))]
         pixels = pixel_set.load(entry)
         lights = torch.from_numpy(np.array(pixels.light_directions))
-        most = min(config.max_lights, entry.n_lights)
-        counts = draw_light_counts(
-            1, config.min_lights, most, min(config.usual_lights, most), generator
-        )
-        chosen = choose_in_cone(lights, int(counts), generator)
+        count = int(config.light_counts(1, generator, available=entry.n_lights))
+        chosen = choose_in_cone(lights, count, generator)
         mask = torch.from_numpy(np.array(pixels.mask))
         scale = 1 + 2.0 * float(torch.rand((), generator=generator))
         scale = scale if torch.rand((), generator=generator) < _ENLARGED_SHARE else 1.0
@@ -162,10 +152,14 @@ class ScenePool:
         else:  # a dark margin, which a lens and its inverse filter mix with the outline
             maps, mask = pad(maps * mask, (REACH,) * 4), pad(mask, (REACH,) * 4)
         truth = torch.nn.functional.normalize(maps[-3:, mask].T, dim=1)
-        observations, lights, _ = photograph_scene(
-            maps[:-3].flatten(1).T, lights, self.config, generator, mask
+        seen = photograph_scene(maps[:-3].flatten(1).T, lights, self.config, generator, mask)
+        features = pixel_features(
+            self.network,
+            seen.observations,
+            seen.light_directions,
+            mask,
+            removed_blur=seen.removed_blur,
         )
-        features = pixel_features(self.network, observations, lights, mask)
         return SceneMaps(_placed(features, mask).half(), _placed(truth, mask).half(), mask[None])
 
     def draw(self, count: int, generator: torch.Generator) -> SceneMaps:
@@ -208,9 +202,14 @@ def _enlarged(maps: Tensor, mask: Tensor, scale: float) -> tuple[Tensor, Tensor]
 
 @torch.no_grad()
 def pixel_features(
-    network: SplineNet, observations: Tensor, light_directions: Tensor, mask: Tensor
+    network: SplineNet,
+    observations: Tensor,
+    light_directions: Tensor,
+    mask: Tensor,
+    *,
+    removed_blur: float | None = None,
 ) -> Tensor:
-    """Return the refinement net's features (P, CHANNELS) of the pixels of a mask (H, W).
+    """Return the refinement net's features (P, FEATURE_CHANNELS) of the pixels of a mask (H, W).
 
     They are the same as at inference in float32.
     """
@@ -233,7 +232,9 @@ def pixel_features(
     def features_of(rows: PixelIndices) -> Tensor:
         values = lighting_at(rows).observations, estimated[rows], errors[rows]
         seen, normals, error = (torch.from_numpy(part).to(lights.device) for part in values)
-        return refine_features(seen, lights, normals, error, reference, signs)
+        return refine_features(
+            seen, lights, normals, error, reference, signs, removed_blur=removed_blur
+        )
 
     return torch.cat([features_of(rows) for rows in parts_of_pixels(len(observations))])
 
@@ -265,16 +266,22 @@ class RefinementLosses(NamedTuple):
 
 
 def refinement_losses(
-    network: SplineNet, maps: SceneMaps, *, detail_weight: float = 0.0, bfloat16: bool = False
+    network: SplineNet,
+    maps: SceneMaps,
+    *,
+    detail_weight: float = 0.0,
+    edge_weight: float = 0.0,
+    bfloat16: bool = False,
 ) -> RefinementLosses:
     """Compute the losses of stacked captures.
 
-    The error of each capture is its mean angle, plus `detail_weight` times the mean error of the
-    differences between neighbours. Wrong lights rotate all normals of a surface alike. This masks
-    the sharpness of the detail in the angles, but not in these differences. The error is divided by
-    the square root of the capture's mean angle before refinement, so a degree has more weight in a
-    capture that is already accurate. The likelihood of the errors is the same as for the error
-    head.
+    The error of each capture is its mean angle, in which a pixel at an edge has a weight of 1 plus
+    `edge_weight` times the largest difference of its true normal to a neighbour's; plus
+    `detail_weight` times the mean error of the differences between neighbours. Wrong lights rotate
+    all normals of a surface alike. This masks the sharpness of the detail in the angles, but not in
+    these differences. The error is divided by the square root of the capture's mean angle before
+    refinement, so a degree has more weight in a capture that is already accurate. The likelihood of
+    the errors is the same as for the error head.
     """
     assert network.refine_net is not None, "TrainingConfig asks for a refinement net"
     with torch.autocast(maps.features.device.type, dtype=torch.bfloat16, enabled=bfloat16):
@@ -301,5 +308,26 @@ def refinement_losses(
         )
         off = (normals - maps.normals).diff(dim=axis + 1).square().sum(dim=1).add(1e-8).sqrt()
         detail = detail + mean_over_capture(off, both) / 2
-    total = balanced(after + detail_weight * detail, before) + 0.05 * surprise.mean()
+    weight = (
+        1 + edge_weight * _largest_step(maps.normals, known)
+        if edge_weight
+        else torch.ones_like(angle)
+    )
+    of_edges = mean_over_capture(angle * weight) / mean_over_capture(weight).clamp(min=1e-6)
+    total = balanced(of_edges + detail_weight * detail, before) + 0.05 * surprise.mean()
     return RefinementLosses(total, before.mean(), after.mean())
+
+
+def _largest_step(normals: Tensor, known: Tensor) -> Tensor:
+    """Return the largest difference (B, H, W) of each normal (B, 3, H, W) to those of its known
+    neighbours.
+    """
+    largest = torch.zeros_like(normals[:, 0])
+    for axis in (1, 2):
+        size = known.shape[axis] - 1
+        both = known.narrow(axis, 1, size) & known.narrow(axis, 0, size)
+        step = normals.diff(dim=axis + 1).norm(dim=1) * both
+        for start in (0, 1):
+            part = largest.narrow(axis, start, size)
+            part.copy_(torch.maximum(part, step))
+    return largest
