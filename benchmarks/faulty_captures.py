@@ -322,11 +322,11 @@ class Recorder:
         self.turns = refiner.turns
 
     def refine(
-        self, mask, observations, lighting_at: LightingAt, normals, errors, *, progress=None
+        self, mask, observations, lighting_at: LightingAt, normals, errors, **options
     ) -> None:
         light = lighting_at(np.arange(len(normals)))
         self.before = normals.copy(), errors.copy()
-        self._refiner.refine(mask, observations, lighting_at, normals, errors, progress=progress)
+        self._refiner.refine(mask, observations, lighting_at, normals, errors, **options)
         self.seen = {
             "observations": light.observations,
             "directions": light.directions,

@@ -104,6 +104,12 @@ STILL: dict[str, Callable[[Path], Path]] = {
     "blurred": lambda folder: write(folder, blurred(photograph(GRAY))),
     "gray images": lambda folder: write(folder, photograph(GRAY)[..., 0]),
     "without mask": lambda folder: write(folder, photograph(GRAY), mask=None),
+    "small under coloured lamps": lambda folder: write(
+        folder,
+        np.pad(photograph(STRONG, LAMPS), ((0, 0), (90, 90), (90, 90), (0, 0))),
+        mask=None,
+        normals=None,
+    ),
     "near lamps": near_lamps,
 }
 OTHERS: dict[str, Callable[[Path], Path]] = {
@@ -135,10 +141,19 @@ def test_infer_and_info_give_the_same_warnings(tmp_path, name, auto_mask):
     assert info["n_pixels"] == report["n_pixels"]
 
 
+def test_the_colours_of_lamps_are_found_on_a_small_object(tmp_path):
+    folder = STILL["small under coloured lamps"](tmp_path / "capture")
+    for align in (False, True):
+        options = InferOptions(method="ls", output=str(tmp_path), auto_mask=True, align=align)
+        report = infer_capture(folder, options)
+        codes = {warning["code"] for warning in report["warnings"]}
+        assert codes == {"estimated_colours", "estimated_intensities"}
+
+
 @pytest.mark.parametrize("name", [*STILL, *OTHERS])
 def test_infer_and_evaluate_give_the_same_error(tmp_path, name):
-    if reading_of(name):
-        pytest.skip("evaluate has no options of reading")
+    if name in ("near lamps", "small under coloured lamps"):
+        pytest.skip("evaluate has no options of reading, and needs ground truth")
     folder = (STILL | OTHERS)[name](tmp_path / "capture")
     report = infer_capture(folder, InferOptions(method="ls", output=str(tmp_path)))
     (result,) = evaluate([folder], [LeastSquares()], Protocol(None)).results
@@ -147,7 +162,10 @@ def test_infer_and_evaluate_give_the_same_error(tmp_path, name):
     )  # as rounded in the report
 
 
-@pytest.mark.parametrize("name", [name for name in STILL if name not in ("8 bits", "near lamps")])
+@pytest.mark.parametrize(
+    "name",
+    [name for name in STILL if name not in ("8 bits", "near lamps", "small under coloured lamps")],
+)
 def test_files_and_arrays_give_the_same_normals(tmp_path, name):
     folder = STILL[name](tmp_path / "capture")
     infer_capture(folder, InferOptions(method="ls", output=str(tmp_path)))
@@ -190,3 +208,22 @@ def test_coloured_lamps_leave_nothing_but_their_warning(tmp_path):
         assert codes == {"estimated_colours", "estimated_intensities"}
         normals = np.load(tmp_path / "capture" / "normals.npy")
         assert angle_between_deg(normals[inside], NORMALS[inside]).mean() < 0.1
+
+
+@pytest.mark.parametrize("given", [{"as_stored": True}, {"intensities": "equal"}], ids=str)
+def test_colours_that_stay_are_no_motion(tmp_path, given):
+    folder = STILL["strongly coloured object"](tmp_path / "capture")
+    found = []
+    for align in (False, True):
+        options = InferOptions(method="ls", output=str(tmp_path), align=align, **given)
+        infer_capture(folder, options)
+        found.append(np.load(tmp_path / "capture" / "normals.npy"))
+    np.testing.assert_array_equal(*found)
+
+
+def test_images_that_are_not_used_may_have_another_size(tmp_path):
+    folder = STILL["plain"](tmp_path / "capture")
+    last = folder / "011.png"
+    cv2.imwrite(str(last), cv2.imread(str(last), cv2.IMREAD_UNCHANGED)[:-4])
+    options = {"method": "ls", "output": str(tmp_path), "light_indices": tuple(range(11))}
+    assert infer_capture(folder, InferOptions(align=True, **options))["n_lights"] == 11

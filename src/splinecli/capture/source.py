@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -118,6 +118,14 @@ class Source:
     def in_channels(self) -> bool:
         """Whether each channel of a colour image has a light of its own."""
         return False
+
+    def divided_by(self, indices: Sequence[int], colours: Float64Array | None) -> Self:
+        """Return the source with images that are also divided by the colours (F, 3) of lamps."""
+        if colours is None:
+            return self
+        intensities = self.light_intensities.copy()
+        intensities[list(indices)] *= colours
+        return replace(self, light_intensities=intensities)
 
     def image_names(self, indices: Sequence[int]) -> list[str]:
         """Return the names of images for messages."""

@@ -298,7 +298,7 @@ class CaptureReading:
             stored = follow(
                 begin(source, self.lights, RecipeOptions(as_stored=as_stored)),
                 last="observations",
-                advance=lambda *_: on_image(next(numbers), n_images),
+                advance=lambda *_: on_image(min(next(numbers), n_images), n_images),
             )
         except OSError as error:
             raise as_splinecli_error(error, self.folder) from error

@@ -57,7 +57,8 @@ def describe_capture(
         source = reading.open(folder)
         _check_outputs(options, source)
         work = begin(source, None, replace(reading.recipe, auto_mask=options.auto_mask))
-        with observer.progress("reading", images_to_read(work)) as advance:
+        n_reads = images_to_read(work)
+        with observer.progress("reading", n_reads) as advance:
             work = follow(work, advance=lambda amount, _: advance(amount))
         capture, judgement = work.made, work.judgement
         assert judgement is not None  # the recipe judges
@@ -69,7 +70,7 @@ def describe_capture(
         for warning in warnings:
             observer.warn(str(warning))
         report = {
-            **_report(work),
+            **_report(work, n_reads),
             "warnings": [str(warning) for warning in warnings],
             "warning_codes": [warning.code for warning in warnings],
         }
@@ -198,7 +199,7 @@ def _check_outputs(options: InfoOptions, source: CaptureSource) -> None:
         check_free(mended_lights.parent, [mended_lights.name], overwrite=options.overwrite)
 
 
-def _report(work: Work) -> dict[str, Any]:
+def _report(work: Work, n_reads: int) -> dict[str, Any]:
     source, capture, images = work.files, work.made, work.images
     files, level = source.files, capture.white_level
     height, width = work.shape
@@ -210,7 +211,7 @@ def _report(work: Work) -> dict[str, Any]:
     stages = expected_seconds(
         capture.n_pixels,
         len(images) * height * width,
-        read_pixels=images_to_read(work) * height * width,
+        read_pixels=n_reads * height * width,
         align=work.options.align,
     )
     seconds = 3 + sum(stages.values())  # 3 to load the libraries and the network

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,10 +21,29 @@ from splinecli.images.alignment import (
     reduced,
     stride_for,
 )
+from splinecli.images.lamps import lamp_colours
+from splinecli.maths import Float64Array
+from splinecli.recipe.reading import compared_pixels
 from splinecli.recipe.work import Work
 from splinecli.records.capture_warnings import IMAGES_ALIGNED, CaptureWarning
 
 LEAST_COMMON = 0.25  # share of the object that all aligned images must show
+
+
+def compare_colours(
+    source: CaptureSource, indices: Sequence[int], advance: Callable[[], object]
+) -> tuple[Float64Array | None, list[CaptureWarning]]:
+    """Return the colours (F, 3) of the lamps of some images, None if they do not differ, and
+    warnings; see lamp_colours.
+    """
+    mask = source.mask_for(indices)
+    rows = compared_pixels(int(np.count_nonzero(mask)))
+    colours = []
+    for pixels in source.read_pixels(mask, indices, lambda each: each, advance, wanted=rows):
+        if pixels.linear.shape[1] != 3:
+            return None, []
+        colours.append(pixels.colours())
+    return lamp_colours(np.stack(colours))
 
 
 def register(work: Work, advance: Callable[[], object]) -> Work:
@@ -42,9 +61,12 @@ def register(work: Work, advance: Callable[[], object]) -> Work:
             f" {MIN_IMAGES}"
         )
         raise InputError(problem, path=folder, hint="Add images, or leave --align out")
-    mask = source.read_mask(work.shape)
+    mask, seen = source.mask_for(indices), source
+    if not work.colours_known:  # they stay in the observations, but would look like motion here
+        colours, _ = compare_colours(source, indices, lambda: None)
+        seen = source.divided_by(indices, colours)
     stride = stride_for(len(indices) * mask.size)
-    read = source.read_pixels(np.ones_like(mask), indices, StoredPixels.observe, advance)
+    read = seen.read_pixels(np.ones_like(mask), indices, StoredPixels.observe, advance)
     images = np.stack([reduced(image.reshape(mask.shape), stride) for image in read])
     lights = None if work.options.finds_lights else source.light_directions[indices]
     found = align_images(images, reduced(mask.astype(np.float32), stride) > 0.5, lights)

@@ -1,10 +1,11 @@
 """The recipe: how the stored pixels of a capture become trusted observations, step by step.
 
-    colours of the lamps -> mask -> registration -> mask of the aligned images -> observations,
+    mask -> colours of the lamps -> registration -> mask of the aligned images -> observations,
     without lens blur -> lights -> intensities -> saturation -> judgement -> refined lights
 
-`infer` follows all steps of the table STEPS, `info` too, a trial of `evaluate` enters at the lights
-with the images of its draw, and arrays enter at the observations. Nothing else prepares images.
+`infer` and `info` follow the table STEPS. `evaluate` reads the observations once, and each trial
+enters at the lights with the images of its draw. Arrays enter at the observations. Nothing else
+prepares images.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from splinecli.capture.formats.images import common_size
 from splinecli.capture.linearise import StoredPixels
 from splinecli.capture.reader import CaptureOptions, open_capture
 from splinecli.capture.record import Capture, check_light_indices
@@ -25,8 +27,8 @@ from splinecli.images.saturation import find_object, restore_saturated
 from splinecli.judge.checks import check_capture
 from splinecli.lights.light_fit import refine_capture
 from splinecli.maths import Float64Array
-from splinecli.recipe.reading import Observed, compared_pixels, exposure_warnings, read_observations
-from splinecli.recipe.registration import register
+from splinecli.recipe.reading import Observed, exposure_warnings, read_observations
+from splinecli.recipe.registration import compare_colours, register
 from splinecli.recipe.work import USUAL, RecipeOptions, Work
 from splinecli.records.capture_warnings import (
     ESTIMATED_INTENSITIES,
@@ -39,27 +41,15 @@ Advance = Callable[[float, str], object]  # called after each image, with 1 and 
 
 
 def find_colours(work: Work, advance: Callable[[], object]) -> Work:
-    """Compare the colours of the images before others compare them pixel by pixel."""
-    source, mask = work.files, work.files.read_mask(work.shape)
-    rows = compared_pixels(int(np.count_nonzero(mask)))
-    colours = []
-    for pixels in source.read_pixels(mask, work.indices, lambda each: each, advance, wanted=rows):
-        if pixels.linear.shape[1] != 3:
-            return replace(work, colours_known=True)
-        colours.append(pixels.colours())
-    return _with_colours(work, *lamp_colours(np.stack(colours)))
+    """Find the colours of the lamps before the registration, which compares images."""
+    return _with_colours(work, *compare_colours(work.files, work.indices, advance))
 
 
 def _with_colours(
     work: Work, colours: Float64Array | None, warnings: Sequence[CaptureWarning]
 ) -> Work:
     """Return the work whose images are divided by the colours (F, 3) of their lamps."""
-    source = work.source
-    if colours is not None:
-        intensities = source.light_intensities.copy()
-        intensities[list(work.indices)] *= colours
-        source = replace(source, light_intensities=intensities)
-    found = (*work.warnings, *warnings)
+    source, found = work.source.divided_by(work.indices, colours), (*work.warnings, *warnings)
     return replace(work, source=source, colours=colours, colours_known=True, warnings=found)
 
 
@@ -69,7 +59,8 @@ def find_mask(work: Work, advance: Callable[[], object]) -> Work:
     Raises InputError if no object stands out.
     """
     source = work.files
-    everywhere = source.window.of(np.ones(work.shape, np.bool_))
+    shape = common_size(source.facts)[0][:2]  # of all images
+    everywhere = source.window.of(np.ones(shape, np.bool_))
     total = np.zeros(everywhere.size, np.float32)
     every = range(source.n_lights)
     for colours in source.read_pixels(everywhere, every, StoredPixels.colours, advance):
@@ -216,11 +207,6 @@ def _compares_colours(work: Work) -> bool:
     return work.source.lamps_may_differ and not (work.colours_known or work.options.as_stored)
 
 
-def _needs_colours(work: Work) -> bool:
-    """Whether a step before the observations compares the images pixel by pixel."""
-    return _compares_colours(work) and (work.options.align or _finds_mask(work))
-
-
 def _finds_mask(work: Work) -> bool:
     return work.options.auto_mask and not work.source.has_mask
 
@@ -245,8 +231,14 @@ class Step:
 
 
 STEPS = (
-    Step("colours", find_colours, _needs_colours, _used, "comparing colours"),
     Step("mask", find_mask, _finds_mask, _every, "finding the object"),
+    Step(
+        "colours",
+        find_colours,
+        lambda work: work.options.align and _compares_colours(work),
+        _used,
+        "comparing colours",
+    ),
     Step("registration", register, lambda work: work.options.align, _used, "aligning"),
     Step(
         "mask of aligned images",
@@ -301,7 +293,7 @@ def prepare_capture(
     options: RecipeOptions = USUAL,
     advance: Advance = lambda amount, note: None,
 ) -> Capture:
-    """Return the capture under the chosen lights (None for all), in the order given, unjudged.
+    """Return the capture under the chosen lights (None for all), in the order given.
 
     Only the images of these lights are read, one at a time. Values outside the mask are ignored.
     Raises the errors of `begin` and of the steps.

@@ -50,7 +50,7 @@ class Work:
     warnings: of the steps before the capture exists.
     capture, saturation, images: set by the step `observations`.
     found_intensities: (F,), estimated together with the lights, or None.
-    judgement: the result of the last step.
+    judgement: set by the step of this name.
     """
 
     source: Source
@@ -79,15 +79,15 @@ class Work:
 
     @property
     def files(self) -> CaptureSource:
-        """The source, of steps that only files need."""
+        """The source, for steps that need files."""
         if not isinstance(self.source, CaptureSource):
             raise UsageError("this step needs a capture in files")
         return self.source
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Height and width of the stored images. Raises InputError if their sizes differ."""
-        return common_size(self.files.facts)[0][:2]
+        """Height and width of the images that are used. Raises InputError if their sizes differ."""
+        return common_size([self.files.facts[index] for index in self.indices])[0][:2]
 
     def choose_images(self, positions: Sequence[int]) -> Work:
         """Return the work on some of the images, with a capture of its own, from their positions.

@@ -189,7 +189,7 @@ class ScenePlan:
             **asdict(self._config_of(position)),
             "seed": self.seed,
             "mesh": shapes or None,
-            "views": int(bool(shapes and self.views)),
+            "views": int(bool(meshes and self.views)),
             "reliefs": [file_sha256(path) for path in self.reliefs],
         }
 
