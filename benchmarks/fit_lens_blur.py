@@ -1,5 +1,5 @@
 """Fit the estimate of the lens blur to rendered captures, and print its constants for
-restoration/lens_blur.py.
+images/lens_blur.py.
 
     python benchmarks/fit_lens_blur.py SET ... [--captures 1600] [--seed 41]
 

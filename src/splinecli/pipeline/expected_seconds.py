@@ -88,7 +88,7 @@ def expected_seconds(
         estimate = costs.network * n_pixels / cores
         found |= {"estimate": estimate, "indirect_light": _INDIRECT * estimate}
     refined, octaves = n_pixels, 0.0
-    while refined > 150_000:  # MOST_PIXELS of refinement/refiner.py, which imports PyTorch
+    while refined > 150_000:  # MOST_PIXELS of estimate/refinement/refiner.py, which imports PyTorch
         octaves += costs.octave * refined
         refined //= 4
     return {**found, "refine": (costs.refine_net * refined + octaves) / cores}
