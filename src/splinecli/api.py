@@ -163,7 +163,8 @@ def estimate_material(estimate: NormalEstimate, colours: ArrayLike | None = None
 
     Returns:
         A record of arrays for the P pixels of the mask, row by row: base_colour (P, 3), and
-        roughness, metalness, specular and confidence (P,). `is_gray` tells whether the base colour is only brightness.
+        roughness, metalness, specular and confidence (P,). `is_gray` tells whether the base colour
+        is only brightness.
 
     Raises:
         splinecli.errors.InputError: there are fewer than four lights, or a colour is not finite.
