@@ -138,8 +138,7 @@ def judge(example: Example, method: str | None) -> tuple[Floats, Floats]:
     matte = likeness(observations[:, held], lambertian(given, normals, lights[held]) * reached)
     print(
         f"{name}: normals {error_deg:.1f} degrees, material {ours.psnr_db} dB, {ours.error:.3f};"
-        " matte"
-        f" {matte.psnr_db} dB, {matte.error:.3f}",
+        f" matte {matte.psnr_db} dB, {matte.error:.3f}",
         flush=True,
     )
     return np.stack(columns, axis=1), np.array(

@@ -190,8 +190,7 @@ def report(runs: Sequence[Path]) -> None:
         change = 100 * np.log(end / start)
         print(
             f"{run.name}: {rows[-1][0]:.0f} core-seconds, {rows[-1][1]:.0f} steps,"
-            f" {start.mean():.3f} -> "
-            f"{end.mean():.3f} deg, {change.mean():+.2f} %"
+            f" {start.mean():.3f} -> {end.mean():.3f} deg, {change.mean():+.2f} %"
             f" ({change.std() / math.sqrt(len(change)):.2f})"
         )
 

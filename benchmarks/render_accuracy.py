@@ -193,8 +193,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         angle = np.degrees(np.arccos(np.clip((normals * ours.normals).sum(axis=1), -1, 1)))
         print(
             f"{index} {scene.shape}: {patches} patches, {len(scene.mesh.faces)} faces,"
-            f" {len(ours.normals)} pixels; "
-            f"drawn in {seconds:.1f} s; normals {angle.mean():.3f} deg"
+            f" {len(ours.normals)} pixels; drawn in {seconds:.1f} s; normals {angle.mean():.3f}"
+            " deg"
         )
         for name in CLASSES:
             shapes = mitsuba_shapes(scene, name)
@@ -226,8 +226,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             total[name].append(float(errors[:, 0].mean()))
             by_light = " ".join(f"{100 * error:5.1f}" for error in errors[:, 0])
             print(
-                f"  {name:9} {100 * errors[:, 0].mean():5.2f} % (by light {by_light}), mean "
-                f"{100 * errors[:, 1].mean():+.2f} %, Mitsuba's noise"
+                f"  {name:9} {100 * errors[:, 0].mean():5.2f} % (by light {by_light}), mean"
+                f" {100 * errors[:, 1].mean():+.2f} %, Mitsuba's noise"
                 f" {100 * errors[:, 2].mean():.2f} %",
                 flush=True,
             )

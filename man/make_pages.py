@@ -41,8 +41,7 @@ FILES = {
     " is orthographic.",
     "CAPTURE/light_intensities.txt": "A line r g b for each image. Optional.",
     "CAPTURE/mask.png": "White on the object (above half of its largest value). Optional:"
-    " without it, every pixel"
-    " belongs to the object.",
+    " without it, every pixel belongs to the object.",
     "CAPTURE/ambient.png": "The object with the lamp off, subtracted from all images. Optional.",
     "CAPTURE/Normal_gt.mat": "True normals. Optional: with them, errors are reported.",
     "OUT/NAME/normals.png": "Normal map, 16-bit RGB, (n + 1) / 2.",
@@ -62,8 +61,7 @@ FILES = {
     " depth.tiff, depth.png": "With --surface, or from splinecli integrate"
     " OUT/NAME, which also writes surface.json and, with --level, level_normals.npy and"
     " level_normals.png. Both can write mesh.obj (with mesh.mtl, mesh.png, mesh_roughness.png and"
-    " mesh_metalness.png)"
-    " and mesh.stl.",
+    " mesh_metalness.png) and mesh.stl.",
     "OUT/NAME/page.html": "With --html: all pictures, and the surface under a light that"
     " follows the pointer.",
     "OUT/NAME/report.json": "Lights, method, weights, options, time, warnings and errors.",
@@ -101,8 +99,7 @@ EXAMPLES = {
     "splinecli prepare --scenes 6 -o set": "Render six scenes in three materials.",
     "splinecli prepare PRPS PRPS_Diffuse -o cycles": "Make a pixel set from the CyclesPS data.",
     "splinecli train set --preset compact --steps 300 -o run": "Train briefly on a pixel set.",
-    "splinecli train"
-    " -o runs/mine"
+    "splinecli train -o runs/mine"
     " --minutes 90": "Train new weights, then use --weights runs/mine/weights.safetensors.",
     "splinecli train -o runs/mine --resume": "Continue after an interruption.",
     "splinecli import-weights 200000-G.ckpt 200000-D.ckpt -o"

@@ -34,9 +34,9 @@ def fill(folder: Path, names: str) -> Path:
 def test_plain_folder_in_natural_order(tmp_path):
     folder = fill(
         tmp_path / "vase",
-        "img10.png img2.PNG img1.png Img3.tif img04.jpeg notes.txt ._img1.png img5.exr "
-        "sub/img6.png lights.txt light_intensities.txt Mask.png normals_gt.npy normal_gt.png "
-        "normals.png error_map.png",
+        "img10.png img2.PNG img1.png Img3.tif img04.jpeg notes.txt ._img1.png img5.exr"
+        " sub/img6.png lights.txt light_intensities.txt Mask.png normals_gt.npy normal_gt.png"
+        " normals.png error_map.png",
     )
     files = find_capture_files(folder)
     assert [path.name for path in files.images] == [

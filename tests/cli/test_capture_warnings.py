@@ -50,8 +50,8 @@ def test_shifted_images_are_named(run, medallion):
     move(medallion / "04.png", 2, -1)
     move(medallion / "09.png", 0, 4)
     words = (
-        "2 of 10 images are shifted against the others, in pixels: 04.png 2 right 1 up, 09.png 4 "
-        "down."
+        "2 of 10 images are shifted against the others, in pixels: 04.png 2 right 1 up, 09.png 4"
+        " down."
     )
     result = run("infer", medallion, "--method", "ls")
     assert result.code == 0 and words in result.err
@@ -69,8 +69,8 @@ def test_the_same_file_under_two_lights(run, medallion):
         shutil.copy(medallion / f"{original}.png", medallion / f"{copy}.png")
     result = run("infer", medallion, "--method", "ls")
     words = (
-        "01.png and 02.png are the same image (and 1 more pair), but their lights differ. Remove "
-        "one,"
+        "01.png and 02.png are the same image (and 1 more pair), but their lights differ. Remove"
+        " one,"
     )
     assert result.code == 0 and words in result.err
     assert codes() == ["repeated_images"]

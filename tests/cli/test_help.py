@@ -81,8 +81,8 @@ def test_help_and_ls_do_not_import_torch(capture):
     """`infer --method ls` and all help run without torch; help also without OpenCV."""
     script = (
         "import sys\nfrom splinecli.cli.main import main\nfor line in sys.argv[1:]:\n    code ="
-        " main(line.split())\n"
-        "    print(code, *sorted({'torch', 'cv2'} & set(sys.modules)), file=sys.stderr)"
+        " main(line.split())\n    print(code, *sorted({'torch', 'cv2'} & set(sys.modules)),"
+        " file=sys.stderr)"
     )
     commands = ["--help", "infer --help", "--version", f"infer {capture} --method ls"]
     call = [sys.executable, "-c", script, *commands]

@@ -186,8 +186,8 @@ def test_memory_that_runs_out_is_one_line(capture, make_capture, run, monkeypatc
     monkeypatch.setattr(cv2, "imdecode", Mock(wraps=cv2.imdecode, side_effect=decoded))
     result = run("infer", capture, "second", "--method", "ls", "-q")
     message = (
-        "splinecli: sphere: there is not enough memory. Close other programs, or use smaller "
-        "images.\n"
+        "splinecli: sphere: there is not enough memory. Close other programs, or use smaller"
+        " images.\n"
     )
     assert (result.code, result.err) == (1, message)
     assert Path("out/second/normals.png").exists()
@@ -205,16 +205,11 @@ def test_a_signal_while_the_program_starts(capture, number):
     before PyTorch and the rest.
     """
     script = (
-        "import os, signal, sys\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background"
-        " ignores it\n"
-        "class Finder:\n"
-        "    def find_spec(self, name, *_):\n"
-        f"        if name == 'splinecli.cli.main': os.kill(os.getpid(), {int(number)})\n"
-        "sys.meta_path.insert(0, Finder())\n"
-        "from splinecli.__main__ import run\n"
-        f"sys.argv = ['splinecli', 'infer', {str(capture)!r}]\n"
-        "run()"
+        "import os, signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)  # a"
+        " job in the background ignores it\nclass Finder:\n    def find_spec(self, name, *_):\n  "
+        "      if name == 'splinecli.cli.main': os.kill(os.getpid(),"
+        f" {int(number)})\nsys.meta_path.insert(0, Finder())\nfrom splinecli.__main__ import"
+        f" run\nsys.argv = ['splinecli', 'infer', {str(capture)!r}]\nrun()"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "splinecli: interrupted.\n")
@@ -241,8 +236,8 @@ def start(code: str) -> subprocess.Popen[str]:
         "print('ready', flush=True)\n    while True:\n        try: time.sleep(60)\n        except"
         " BaseException: pass",
         # A call into C that no signal interrupts.
-        "import numpy; a = numpy.ones((3000, 3000)); print('ready', flush=True)\n"
-        "    for _ in range(60): a @ a",
+        "import numpy; a = numpy.ones((3000, 3000)); print('ready', flush=True)\n    for _ in"
+        " range(60): a @ a",
     ],
 )
 def test_sigterm_always_ends_a_process(code):

@@ -65,8 +65,8 @@ def test_the_camera_of_exif(run, document):
     assert report["camera_matrix"] is None
     assert report["exif_camera_matrix"] == [[500, 0, 179.5], [0, 500, 119.5], [0, 0, 1]]
     words = (
-        "treated as orthographic; EXIF suggests a --camera-matrix with the rows 500 0 179.5, 0 500 "
-        "119.5, 0 0 1"
+        "treated as orthographic; EXIF suggests a --camera-matrix with the rows 500 0 179.5, 0"
+        " 500 119.5, 0 0 1"
     )
     assert f"camera       {words}" in run("info", "photographs").out
 

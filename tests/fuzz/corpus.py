@@ -251,9 +251,8 @@ def training(folder: Path) -> None:
 def write_settings(folder: Path) -> None:
     (folder / "a.toml").write_text(
         "steps = 1\nbatch_size = 4\nseed = 3\nlearning_rate = 1e-3\nschedule ="
-        " 'cosine'\nheld_share = 0.0\n"
-        "[pixels]\nmin_lights = 4\nmax_lights = 6\nusual_lights = 5\n"
-        "[network]\nmap_size = 8\nwidth = 2\nli_blocks = 1\nne_blocks = 1\nhead_width = 4\n"
+        " 'cosine'\nheld_share = 0.0\n[pixels]\nmin_lights = 4\nmax_lights = 6\nusual_lights ="
+        " 5\n[network]\nmap_size = 8\nwidth = 2\nli_blocks = 1\nne_blocks = 1\nhead_width = 4\n"
     )
 
 
@@ -301,8 +300,8 @@ TARGETS = (
                 "vectors.npy utf16.txt commas.txt named.csv list.json rig.dome",
             ),
             "infer . --method ls --lights azel.txt --light-format azel -o out --overwrite",
-            "infer . --method ls --light-positions positions.txt --pixel-size 1 --camera-matrix "
-            "camera.txt -o out --overwrite",
+            "infer . --method ls --light-positions positions.txt --pixel-size 1 --camera-matrix"
+            " camera.txt -o out --overwrite",
         ),
     ),
     Target(
@@ -310,8 +309,8 @@ TARGETS = (
         normal_maps,
         ("*",),
         each(
-            "integrate {} --mask mask.png --colours colours.jpg --camera-matrix camera.txt -o out "
-            "--overwrite",
+            "integrate {} --mask mask.png --colours colours.jpg --camera-matrix camera.txt -o out"
+            " --overwrite",
             "n.png n.tif n.npy n.mat packed.mat",
         ),
     ),
@@ -369,8 +368,8 @@ TARGETS = (
             "infer second --method ls -o out --html --surface",
             "infer capture --method ls -o out --update",
             "integrate out/capture -o out/capture --overwrite",
-            "evaluate capture --method ls --n-lights 4 --n-lights 5 --trials 1 -o out/new "
-            "--figures --overwrite",
+            "evaluate capture --method ls --n-lights 4 --n-lights 5 --trials 1 -o out/new"
+            " --figures --overwrite",
             "prepare capture -o out/set",
         ),
         earlier=(

@@ -243,8 +243,8 @@ def test_nothing_is_cut_at_the_edges_and_the_bar_runs_over_the_whole_scale():
     for error_deg in (0.0, TOP_DEG / 2, TOP_DEG):
         assert (picture == error_colour(error_deg)).all(axis=2).sum() >= 10
     long = (
-        "a capture with quite a long name, 10 lights, draw 1 of 10, seed 0, light noise of 2 "
-        "degrees $x$"
+        "a capture with quite a long name, 10 lights, draw 1 of 10, seed 0, light noise of 2"
+        " degrees $x$"
     )
     for methods in (["ls"], ["a method with a long name", "b"]):
         picture = draw(20, 30, methods, title=long)

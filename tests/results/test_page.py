@@ -192,8 +192,7 @@ def views(
     edge = 64
     style = (
         f".surface {{ position: fixed !important; left: {edge}px; top: {edge}px; width: {SIDE}px"
-        " !important }"
-        "#view { border-radius: 0 }"
+        " !important }#view { border-radius: 0 }"
     )
     page = open_page(
         html.replace("</head>", f"<style>{style}</style></head>"), fragments[0], webgl=webgl

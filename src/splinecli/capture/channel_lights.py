@@ -54,8 +54,8 @@ class ChannelLights:
 
     def in_words(self) -> str:
         text = (
-            "The channels R, G, B of each image are read as photographs under three lamps."
-            " This is only valid for gray objects; coloured objects get wrong normals."
+            "The channels R, G, B of each image are read as photographs under three lamps. This"
+            " is only valid for gray objects; coloured objects get wrong normals."
         )
         if self.measured:
             return text
@@ -97,8 +97,8 @@ def channel_lights(path: Path | None, n_images: int) -> ChannelLights:
         (CHANNELS * n_images, CHANNELS),
     ):
         raise InputError(
-            f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3,"
-            " or 3 lines for each image",
+            f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3, or 3 lines for"
+            " each image",
             path,
             hint="Line c, column l: the response of channel c to lamp l, R G B",
         )

@@ -142,8 +142,8 @@ def copies(images: Sequence[Path]) -> list[CaptureWarning]:
         ", ".join(sorted({path.suffix.lower() for path in paths})) for paths in (others, images)
     )
     text = (
-        f"{len(others)} files ({kinds}) have the names of other images ({used}):"
-        " they show the same photographs, and"
+        f"{len(others)} files ({kinds}) have the names of other images ({used}): they show the"
+        " same photographs, and"
     )
     return [CaptureWarning(IMAGES_LEFT_OUT, f"{text} were left out.")]
 
@@ -318,13 +318,13 @@ def choose_mask(
     text = f"{masks[0].name} is used as the mask, by its name. Give --mask FILE for another one."
     if masks[0] in images:
         text = (
-            f"The alpha channel of {masks[0].name} is used as the mask."
-            " Give --mask FILE for another one."
+            f"The alpha channel of {masks[0].name} is used as the mask. Give --mask FILE for"
+            " another one."
         )
     if len(masks) > 1:
         text = (
-            f"{', '.join(path.name for path in masks)}: none is used as the mask."
-            " Choose one with --mask FILE."
+            f"{', '.join(path.name for path in masks)}: none is used as the mask. Choose one with"
+            " --mask FILE."
         )
     return masks[0] if len(masks) == 1 else None, (CaptureWarning(MASK_CHOICE, text),)
 

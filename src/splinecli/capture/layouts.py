@@ -282,9 +282,9 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
     if lights is None and overrides.needs_lights:
         option = light_option([folder, _parent(folder)], len(images))
         hint = (
-            "Pass --lights FILE, with one line x y z for each image."
-            " 'splinecli calibrate' makes the file from images of a mirror ball. Without one,"
-            " --lights estimate finds them from the images, with lower accuracy"
+            "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes"
+            " the file from images of a mirror ball. Without one, --lights estimate finds them"
+            " from the images, with lower accuracy"
         )
         raise InputError(
             f"the folder contains {len(images)} images but no light file ({light_names()})",

@@ -292,8 +292,8 @@ def unit_directions(
     for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
         if not vector.any():
             raise InputError(
-                f"found a zero vector{place},"
-                f" expected a {'lamp position' if lamps else 'light direction'}",
+                f"found a zero vector{place}, expected a"
+                f" {'lamp position' if lamps else 'light direction'}",
                 path,
                 line=line,
                 hint="Write x y z towards the light, or remove the line and its image",

@@ -226,8 +226,8 @@ def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     is_matrix = array.ndim == 2 and array.dtype.kind in "fiu" and array.size
     if not is_matrix or not np.isfinite(array).all():
         raise InputError(
-            f"found an array of shape {array.shape} and type {array.dtype},"
-            " expected finite numbers N x 3",
+            f"found an array of shape {array.shape} and type {array.dtype}, expected finite"
+            " numbers N x 3",
             path,
         )
     rows = enumerate(array.astype(np.float64).tolist(), start=1)

@@ -160,14 +160,14 @@ def check_angles(table: NumberRows, form: RowForm) -> None:
         if not (0 < elevation <= 90 and abs(azimuth) <= 360):
             if form == "slant-tilt":
                 problem = (
-                    f"found slant {first:g} and tilt {second:g}, expected 0 to below 90 and -360 to"
-                    " 360 degrees"
+                    f"found slant {first:g} and tilt {second:g}, expected 0 to below 90 and -360"
+                    " to 360 degrees"
                 )
                 hint = "The slant counts from the camera axis"
             else:
                 problem = (
-                    f"found azimuth {first:g} and elevation {second:g},"
-                    " expected -360 to 360 and above 0 to 90"
+                    f"found azimuth {first:g} and elevation {second:g}, expected -360 to 360 and"
+                    " above 0 to 90"
                 )
                 problem += " degrees"
                 hint = (
@@ -209,8 +209,8 @@ def refuse_angles(table: NumberRows) -> None:
     found, hint = "", AZEL_HINT
     if max(abs(value) for row in rows for value in row[-2:]) > 2 and (lengths == {2} or numbered):
         found = (
-            f"{'a number and two angles' if numbered else '2 columns of angles'},"
-            " expected 3 columns (x y z)"
+            f"{'a number and two angles' if numbered else '2 columns of angles'}, expected 3"
+            " columns (x y z)"
         )
     elif lengths == {3} and not numbered:
         # Perhaps all have the same radius. Vectors around an object have y < 0.

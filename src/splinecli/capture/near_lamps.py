@@ -184,8 +184,8 @@ def _within_lobes(lobes: Float64Array, towards: Floats) -> Float32Array:
 
 
 UNIT_HINT = (
-    "Give all lengths in one unit, such as millimetres: the lamps' positions or distance,"
-    " and the pixel size or object width"
+    "Give all lengths in one unit, such as millimetres: the lamps' positions or distance, and the"
+    " pixel size or object width"
 )
 
 
@@ -199,8 +199,8 @@ def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> li
     distances = np.linalg.norm(lamps.positions - middle, axis=1)
     nearest = int(distances.argmin())
     text = (
-        f"lamp {nearest + 1} is {distances[nearest]:.3g} from the middle of the object,"
-        f" which is {sizes[0]:.3g} wide"
+        f"lamp {nearest + 1} is {distances[nearest]:.3g} from the middle of the object, which is"
+        f" {sizes[0]:.3g} wide"
     )
     if distances[nearest] < 0.5 * min(sizes):
         raise InputError(f"{text}: it would be inside the object", positions, hint=UNIT_HINT)
@@ -225,16 +225,16 @@ def distant_lights(
     name = "the lamps' positions" if positions is None else positions.name
     if lamps is None:
         text = (
-            f"{name} is not used, because the size of a pixel is unknown."
-            " Give --pixel-size or --object-width."
+            f"{name} is not used, because the size of a pixel is unknown. Give --pixel-size or"
+            " --object-width."
         )
         return [CaptureWarning(NEAR_LAMPS, text)]
     if (angle_deg := lamps.angles_across_deg(mask).max()) <= 2.0:
         return []
     text = (
-        f"The lamps are near: by {name}, a light direction changes by up to {angle_deg:.0f} degrees"
-        " between the middle and the edge of the object, but the lights are treated as distant."
-        " Use --light-positions instead of --lights."
+        f"The lamps are near: by {name}, a light direction changes by up to {angle_deg:.0f}"
+        " degrees between the middle and the edge of the object, but the lights are treated as"
+        " distant. Use --light-positions instead of --lights."
     )
     return [CaptureWarning(NEAR_LAMPS, text)]
 
@@ -255,8 +255,8 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
         return []
     text = (
         f"The vectors of {path.name} have lengths from {lengths.min():.4g} to {lengths.max():.4g},"
-        " as positions of lamps have, but are read as directions. If they are positions,"
-        " use --light-positions."
+        " as positions of lamps have, but are read as directions. If they are positions, use"
+        " --light-positions."
     )
     return [CaptureWarning(NEAR_LAMPS, text)]
 

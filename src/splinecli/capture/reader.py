@@ -220,8 +220,8 @@ def _read_all_lights(
             raise
         problem = error.problem.replace("one for each image", "three for each image")
         hint = (
-            "With --lights-in-channels, the file needs three lines for each image, in the order R,"
-            " G, B"
+            "With --lights-in-channels, the file needs three lines for each image, in the order"
+            " R, G, B"
         )
         raise InputError(problem, path=error.path, hint=hint) from None
 
@@ -242,8 +242,8 @@ def _turned_by_viewers(facts: Sequence[ImageHeader]) -> list[CaptureWarning]:
     if orientation == UPRIGHT:
         return []
     text = (
-        f"Viewers turn the images (EXIF orientation {orientation}), splinecli does not: mask, light"
-        " directions and results are in the frame of the stored pixels."
+        f"Viewers turn the images (EXIF orientation {orientation}), splinecli does not: mask,"
+        " light directions and results are in the frame of the stored pixels."
     )
     return [CaptureWarning(codes.EXIF_ORIENTATION, text)]
 
@@ -264,8 +264,8 @@ def _read_lights(
         names = ", ".join(others[:3]) + (", ..." if len(others) > 3 else "")
         them = "it" if len(others) == 1 else "them"
         text = (
-            f"{names}: left out, because {path.name} has no light for {them}, and the"
-            " other images have another"
+            f"{names}: left out, because {path.name} has no light for {them}, and the other images"
+            " have another"
         )
         text += f" {'size' if len(set(map(_stated_size, files.images))) > 1 else 'form of name'}."
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))

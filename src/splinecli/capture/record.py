@@ -51,8 +51,7 @@ def azimuth_of(first_light: str) -> float:
     if not abs(azimuth) <= 360:
         raise UsageError(
             f"the first light comes from {first_light!r}; expected one of {', '.join(SIDES_DEG)},"
-            " or its azimuth in"
-            " degrees, counter-clockwise from the right"
+            " or its azimuth in degrees, counter-clockwise from the right"
         )
     return azimuth
 

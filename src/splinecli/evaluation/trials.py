@@ -350,8 +350,7 @@ def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
         if without:
             notes.append(
                 f"{name}: {without} of {capture.n_pixels} pixels in the mask have no ground-truth"
-                " normal"
-                " and are not scored."
+                " normal and are not scored."
             )
     return tuple(notes)
 

@@ -41,9 +41,8 @@ def shifted_images(seen: Evidence) -> Iterator[CaptureWarning]:
     more = f" and {len(shifts) - _MOST_NAMED} more" if len(shifts) > _MOST_NAMED else ""
     text = (
         f"{len(shifts)} of {len(names)} images {'is' if len(shifts) == 1 else 'are'} shifted"
-        " against the others, in"
-        f" pixels: {named}{more}. The camera or the object moved. Add --align, or photograph from"
-        " a tripod."
+        f" against the others, in pixels: {named}{more}. The camera or the object moved. Add"
+        " --align, or photograph from a tripod."
     )
     yield CaptureWarning(codes.IMAGES_SHIFTED, text, seen.shift_error_deg)
 
@@ -69,9 +68,9 @@ def other_scale(seen: Evidence) -> Iterator[CaptureWarning]:
         mended[:, place] /= factor
         how = f"{1 / factor:.0f} times darker" if factor < 1 else f"{factor:.0f} times brighter"
         text = (
-            f"{name} is {how} than the other images predict, as if it had {16 - bits}"
-            " bits and the others 16, or"
-            f" vice versa. Save all images with the same bit depth, or scale it by 2^{bits}."
+            f"{name} is {how} than the other images predict, as if it had {16 - bits} bits and the"
+            " others 16, or vice versa. Save all images with the same bit depth, or scale it by"
+            f" 2^{bits}."
         )
         yield CaptureWarning(
             codes.IMAGE_SCALE, text, median_turn_deg(seen.observations, lights, lights, mended)
@@ -100,10 +99,9 @@ def odd_image(seen: Evidence) -> list[CaptureWarning]:
     )
     text = (
         f"{seen.names[odd.place]} contradicts the other images{how}: leaving it out reduces the"
-        " residual to"
-        f" {100 * odd.left:.0f} %. Its lamp may have moved or failed, its exposure may differ, or"
-        " a shadow may have"
-        " fallen on the object. Photograph it again, or leave it out."
+        f" residual to {100 * odd.left:.0f} %. Its lamp may have moved or failed, its exposure may"
+        " differ, or a shadow may have fallen on the object. Photograph it again, or leave it"
+        " out."
     )
     return [CaptureWarning(codes.IMAGE_INCONSISTENT, text, _turn_by_deg(seen, [odd.place]))]
 
@@ -171,8 +169,8 @@ def rough_lights(seen: Evidence) -> list[CaptureWarning]:
     moved_deg = angle_between_deg(refined.directions, seen.directions)
     text = (
         f"The light directions are probably inaccurate: moving them by {moved_deg.mean():.1f}"
-        " degrees on average"
-        f" reduces the residual to {100 * refined.fit_ratio:.0f} %. Try --refine-lights."
+        f" degrees on average reduces the residual to {100 * refined.fit_ratio:.0f} %. Try"
+        " --refine-lights."
     )
     return [CaptureWarning(codes.ROUGH_LIGHTS, text)]
 
@@ -199,27 +197,23 @@ def other_readings(seen: Evidence, largest_ratio: float = 1.0) -> list[CaptureWa
     if reading.kind == "curve":
         text = (
             "The images look display-encoded but are read as linear: if their values are decoded,"
-            f" {left}. Add"
-            " --transfer"
+            f" {left}. Add --transfer"
             f" srgb{'' if reading.amount == SRGB_EXPONENT else f' or gamma:{reading.amount:g}'}."
         )
         return [CaptureWarning(codes.NONLINEARITY_SUSPECTED, text, error_deg)]
     if reading.kind == "near":
         text = (
             f"The lamps look near, about {reading.amount:.1f} widths of the object away, but are"
-            " treated as distant: at"
-            f" this distance, {left}. Measure the distance and the width of the object, or try"
-            " --light-distance"
-            f" {reading.amount:.1f} --object-width 1."
+            f" treated as distant: at this distance, {left}. Measure the distance and the width of"
+            f" the object, or try --light-distance {reading.amount:.1f} --object-width 1."
         )
         return [CaptureWarning(codes.NEAR_LIGHTS_SUSPECTED, text, error_deg)]
     if reading.kind == "offset":
         text = (
             "All images look as if they contained ambient light, or a black level that was not"
-            " subtracted:"
-            f" {100 * reading.amount:.0f} % of the light of a lamp. Without it, {left}. Photograph"
-            " the object with all"
-            " lamps off and give this image with --ambient."
+            f" subtracted: {100 * reading.amount:.0f} % of the light of a lamp. Without it,"
+            f" {left}. Photograph the object with all lamps off and give this image with"
+            " --ambient."
         )
         return [CaptureWarning(codes.CONSTANT_LIGHT, text, error_deg)]
     return [
@@ -240,9 +234,8 @@ def _intensities_text(seen: Evidence, reading: Explanation, left: str) -> str:
     if given is None:
         return (
             f"The lights seem to differ in intensity: with other intensities, {left}. The images"
-            " do not determine them,"
-            " so equal ones are assumed. Measure them with calibrate --gray-card, or give them"
-            " with --intensities FILE."
+            " do not determine them, so equal ones are assumed. Measure them with calibrate"
+            " --gray-card, or give them with --intensities FILE."
         )
     needed = np.log(given * reading.intensities)
     ways = {
@@ -259,9 +252,8 @@ def _intensities_text(seen: Evidence, reading: Explanation, left: str) -> str:
         else ""
     )
     return (
-        f"The given light intensities do not fit the images: with others{how},"
-        f" {left}. Check that their"
-        " file is in the order of the images, or leave them out with --intensities equal."
+        f"The given light intensities do not fit the images: with others{how}, {left}. Check that"
+        " their file is in the order of the images, or leave them out with --intensities equal."
     )
 
 
@@ -396,8 +388,8 @@ def check_confidence(expected_under_5: float | None) -> list[CaptureWarning]:
         return []
     text = (
         f"The network expects only {100 * expected_under_5:.0f} % of the normals to be within 5"
-        " degrees. The lights,"
-        " the mask or the images are probably wrong: see docs/troubleshooting.md."
+        " degrees. The lights, the mask or the images are probably wrong: see"
+        " docs/troubleshooting.md."
     )
     return [CaptureWarning(codes.LOW_CONFIDENCE, text)]
 

@@ -358,12 +358,10 @@ def light_warnings(
     if check.lacks_shadows:
         text = (
             f"Under the lights of {light_file.name}, the surface should cast shadows that are not"
-            " in the images. With"
-            " x and y of the lights negated, bumps become hollows, and fewer shadows are missing."
-            " The images do not"
-            " decide which is right. Compare bumps and hollows with the object. If they are"
-            " exchanged, run again with"
-            f" --light-frame {BOTH_NEGATED.after(frame)}."
+            " in the images. With x and y of the lights negated, bumps become hollows, and fewer"
+            " shadows are missing. The images do not decide which is right. Compare bumps and"
+            " hollows with the object. If they are exchanged, run again with --light-frame"
+            f" {BOTH_NEGATED.after(frame)}."
         )
         # A bump looks the same as a hollow. With this error, about a quarter of the normals of a
         # good capture are expected within 5 degrees.
@@ -381,9 +379,9 @@ def _order_text(check: LightCheck, light_file: Path) -> str:
     given = 100 * check.given_misfit
     if check.order == UNKNOWN_ORDER:
         return (
-            f"The images fit {light_file.name} no better than lights in a random order"
-            f" (misfit {given:.0f} % of a random order's). Its lines are in another order than the"
-            " images, or it belongs to another capture."
+            f"The images fit {light_file.name} no better than lights in a random order (misfit"
+            f" {given:.0f} % of a random order's). Its lines are in another order than the images,"
+            " or it belongs to another capture."
         )
     remedy = "Check that its lines are in the order of the images."
     if check.order == ZENITH:
@@ -393,13 +391,11 @@ def _order_text(check: LightCheck, light_file: Path) -> str:
         if check.order_misfit > HALF_LEFT * check.given_misfit:  # a ring, recognised by the albedo
             return (
                 f"{light_file.name} probably contains half vectors, half-way between the lights"
-                " and the camera axis:"
-                f" under them, steep slopes look brighter. {remedy}"
+                f" and the camera axis: under them, steep slopes look brighter. {remedy}"
             )
     return (
-        f"The images fit the lights of {light_file.name} much better {check.order}"
-        f" (misfit {100 * check.order_misfit:.0f} % of a random order's, against {given:.0f} %)."
-        f" {remedy}"
+        f"The images fit the lights of {light_file.name} much better {check.order} (misfit"
+        f" {100 * check.order_misfit:.0f} % of a random order's, against {given:.0f} %). {remedy}"
     )
 
 

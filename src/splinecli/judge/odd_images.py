@@ -304,9 +304,8 @@ def check_ground_truth(
         kind, lights = codes.GROUND_TRUTH_Z, ""
     text = (
         f"The ground truth is {angles[0]:.0f} degrees from normals that fit the images, but"
-        f" {angles[best]:.0f} degrees"
-        f" with {frame.describe()}: it is probably in this frame{lights}, so the errors mean"
-        " nothing."
+        f" {angles[best]:.0f} degrees with {frame.describe()}: it is probably in this"
+        f" frame{lights}, so the errors mean nothing."
     )
     # Either the ground truth or the normals are wrong by this angle.
     return [CaptureWarning(kind, text, angles[0] if kind == codes.GROUND_TRUTH_FRAME else None)]
@@ -353,9 +352,8 @@ def _shifted(normals: Float64Array, truth: Floats, sample: Sample) -> list[Captu
     )
     text = (
         f"The ground truth is {before:.1f} degrees from normals that fit the images, but"
-        f" {after:.1f} degrees once"
-        f" a shift of {named} is undone: it is probably shifted against the images, so the errors"
-        " mean nothing."
+        f" {after:.1f} degrees once a shift of {named} is undone: it is probably shifted against"
+        " the images, so the errors mean nothing."
     )
     return [CaptureWarning(codes.GROUND_TRUTH_SHIFTED, text)]
 

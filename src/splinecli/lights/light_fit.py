@@ -243,8 +243,8 @@ def refine_capture(
     moved_deg = angle_between_deg(found.directions, capture.light_directions)
     text = (
         f"The light directions were refined: they moved by {moved_deg.mean():.1f} degrees on"
-        " average, at most"
-        f" {moved_deg.max():.1f}, which reduces the residual to {100 * found.fit_ratio:.0f} %."
+        f" average, at most {moved_deg.max():.1f}, which reduces the residual to"
+        f" {100 * found.fit_ratio:.0f} %."
     )
     return replace(
         capture,

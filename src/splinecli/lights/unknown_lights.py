@@ -261,12 +261,11 @@ def find_lights(
     if refuse and first_light is None and not outlined:
         remedy = "add --auto-mask, or give its mask" if mask.all() else "give a mask of all of it"
         raise InputError(
-            "the images do not show the outline of the object, so a bump looks like"
-            " a hollow under opposite lights",
+            "the images do not show the outline of the object, so a bump looks like a hollow"
+            " under opposite lights",
             hint=f"If the images show the whole object, {remedy}. Else say where the light of"
-            " the first image that is used comes from: --first-light left, upper-left,"
-            " or its azimuth in degrees,"
-            " counter-clockwise from the right",
+            " the first image that is used comes from: --first-light left, upper-left, or its"
+            " azimuth in degrees, counter-clockwise from the right",
         )
     directions, errors_deg, intensities = _ask_network(observations, mask)
     if first_light is not None:
@@ -279,8 +278,8 @@ def find_lights(
     # Rendered scenes, including metals, reach at most half of this value.
     if refuse and fit is not None and fit.after > 0.08:
         problem = (
-            "the images do not show one surface under different distant lights, so"
-            " the lights cannot be found"
+            "the images do not show one surface under different distant lights, so the lights"
+            " cannot be found"
         )
         hint = "Check that camera and object stood still, and that all images show the same object"
         raise InputError(problem, hint=hint)
@@ -312,12 +311,10 @@ def find_lights(
     errors_deg = (1 - opposite_share) * errors_deg + opposite_share * opposite_deg
     if refuse and (expected := float(errors_deg.mean())) > LARGEST_ERROR_DEG:
         raise InputError(
-            "the images do not determine the lights: their estimated error is"
-            f" {expected:.0f} degrees, expected at most"
-            f" {LARGEST_ERROR_DEG:.0f}",
+            f"the images do not determine the lights: their estimated error is {expected:.0f}"
+            f" degrees, expected at most {LARGEST_ERROR_DEG:.0f}",
             hint="Show the whole outline of the object and give its mask, add images with"
-            " other lights, or measure the"
-            " lights with 'splinecli calibrate'",
+            " other lights, or measure the lights with 'splinecli calibrate'",
         )
     return FoundLights(
         directions, errors_deg, None if intensities_known else intensities / intensities.mean()
@@ -339,8 +336,8 @@ def _towards(directions: Float64Array, first_light: str) -> Float64Array:
             f"the first light does not come clearly from {first_light}, nor from the opposite side"
         )
         hint = (
-            "Give its azimuth in degrees, as --first-light 45, or put an image with"
-            " a light from a side first"
+            "Give its azimuth in degrees, as --first-light 45, or put an image with a light from"
+            " a side first"
         )
         raise InputError(problem, hint=hint)
     return directions * (-1, -1, 1) if towards < 0 else directions

@@ -100,8 +100,8 @@ def ray_basis(camera_matrix: Floats) -> Float64Array:
         and (matrix[2] == (0, 0, 1)).all()
     ):
         raise InputError(
-            f"{matrix.tolist()} is not a camera matrix [[fx, s, cx], [0, fy, cy], [0, 0,"
-            " 1]] with positive fx and fy, and numbers of at most a million",
+            f"{matrix.tolist()} is not a camera matrix [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with"
+            " positive fx and fy, and numbers of at most a million",
             hint="Give it in pixels, with columns to the right and rows down",
         )
     return np.asarray(np.linalg.inv(matrix).T * (1, -1, -1), np.float64)

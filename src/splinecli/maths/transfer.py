@@ -54,8 +54,8 @@ def parse_transfer(text: str) -> float | None:
         if GAMMAS[0] <= gamma <= GAMMAS[1]:
             return gamma
     raise UsageError(
-        f"the transfer curve is {text!r}; expected auto, linear, srgb,"
-        " or gamma:G with G from 0.1 to 10"
+        f"the transfer curve is {text!r}; expected auto, linear, srgb, or gamma:G with G from 0.1"
+        " to 10"
     )
 
 

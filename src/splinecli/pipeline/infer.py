@@ -150,7 +150,7 @@ def distil_for(
         if distilled.distillation.is_good:
             return distilled, []
     text = (
-        f"The network estimated every pixel. A small one learned from a sample, but was"
+        "The network estimated every pixel. A small one learned from a sample, but was"
         f" {distilled.distillation.mean_deg:.1f} degrees away from it, where it expects errors of"
         f" {distilled.distillation.expected_deg:.1f} degrees."
     )

@@ -143,8 +143,8 @@ class WorkerOptions(Record, frozen=True, kw_only=True):
 
     workers: int = option(
         "Processes and machines",
-        "Number of parallel processes on this machine (needs the extra 'cluster'). auto"
-        " chooses by cores and memory.",
+        "Number of parallel processes on this machine (needs the extra 'cluster'). auto chooses"
+        " by cores and memory.",
         "N|auto",
         value=1,
         parse=parse_workers,
@@ -157,8 +157,8 @@ class ClusterOptions(WorkerOptions, frozen=True, kw_only=True):
     # the address or the scheduler file of a Dask scheduler
     address: str | None = option(
         "Processes and machines",
-        "Compute on the workers of a running Dask cluster: the address of its scheduler, or"
-        " its scheduler file (needs the extra 'cluster').",
+        "Compute on the workers of a running Dask cluster: the address of its scheduler, or its"
+        " scheduler file (needs the extra 'cluster').",
         "ADDRESS|FILE",
         names="--cluster",
     )
@@ -207,8 +207,8 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
     )
     transfer: str = option(
         "Input",
-        "Transfer curve of the images: auto, linear, srgb or gamma:G. auto follows the files,"
-        " and reads JPEG as sRGB.",
+        "Transfer curve of the images: auto, linear, srgb or gamma:G. auto follows the files, and"
+        " reads JPEG as sRGB.",
         "CURVE",
         value=AUTOMATIC,
         complete=CURVES,
@@ -224,23 +224,23 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
     white_level: GivenWhiteLevel = None
     lights: FileName | None = option(
         "Lights",
-        f"Light directions ({light_suffixes()}): x y z for each image, z to the camera."
-        " estimate derives them from the images, less accurately than a calibration.",
+        f"Light directions ({light_suffixes()}): x y z for each image, z to the camera. estimate"
+        " derives them from the images, less accurately than a calibration.",
         "FILE|estimate",
         "the light file in CAPTURE",
     )
     first_light: str | None = option(
         "Lights",
-        "With --lights estimate: the side that the first light comes from, such as left, above"
-        " or upper-left, or its azimuth, counter-clockwise from the right. Needed if the"
-        " images show no outline of the object.",
+        "With --lights estimate: the side that the first light comes from, such as left, above or"
+        " upper-left, or its azimuth, counter-clockwise from the right. Needed if the images show"
+        " no outline of the object.",
         "SIDE|DEGREES",
         complete=tuple(SIDES_DEG),
     )
     light_frame: str | None = option(
         "Lights",
-        f"Frame of the light file: any of x-left, y-down, z-away and {EXCHANGED} (y comes"
-        " before x).",
+        f"Frame of the light file: any of x-left, y-down, z-away and {EXCHANGED} (y comes before"
+        " x).",
         "LIST",
         "x right, y up, z to the camera",
         complete=records.complete_list(("x-left", "y-down", "z-away", EXCHANGED)),
@@ -259,8 +259,8 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
     )
     lights_in_channels: bool = flag(
         "Lights",
-        "The channels of each colour image are photographs under three coloured lamps; the"
-        " light file has three lights for each image, in the order R, G, B. For gray objects.",
+        "The channels of each colour image are photographs under three coloured lamps; the light"
+        " file has three lights for each image, in the order R, G, B. For gray objects.",
     )
     crosstalk: FileName | None = option(
         "Lights",
@@ -289,8 +289,8 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
     )
     camera_matrix: FileName | None = option(
         "Lights",
-        "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera: each pixel"
-        " is then estimated in the frame of its viewing ray.",
+        "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera: each pixel is"
+        " then estimated in the frame of its viewing ray.",
         "FILE",
         "camera_matrix.txt in CAPTURE, or orthographic",
     )
@@ -461,8 +461,8 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
     weights: Weights = None
     distil: bool | None = option(
         "Speed",
-        "Approximate the network with a smaller one, trained on a sample of the capture's"
-        " pixels, or use the method on every pixel.",
+        "Approximate the network with a smaller one, trained on a sample of the capture's pixels,"
+        " or use the method on every pixel.",
         default="--distil from 100,000 pixels, else --exact",
         names="--distil/--exact",
     )
@@ -473,8 +473,8 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
     )
     formats: tuple[str, ...] = option(
         "Output",
-        f"Files of the normal map: any of {records.listed(NORMALS)}. png has 16 bits, png8 has"
-        " 8, npy and tiff are float32. With exr (needs the extra 'exr'), albedo and depth are"
+        f"Files of the normal map: any of {records.listed(NORMALS)}. png has 16 bits, png8 has 8,"
+        " npy and tiff are float32. With exr (needs the extra 'exr'), albedo and depth are"
         " written as EXR, too.",
         "LIST",
         value=("png", "npy"),
@@ -684,8 +684,8 @@ class InfoOptions(Display, frozen=True, kw_only=True):
     )
     mended_lights: Path | None = option(
         "Lights",
-        "If the light directions fit the images better in another order or frame, write them"
-        " in it.",
+        "If the light directions fit the images better in another order or frame, write them in"
+        " it.",
         "FILE",
     )
     plot: Path | None = option("Output", "Also plot the light directions to a PNG file.", "FILE")

@@ -128,14 +128,13 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         (
             "exposure",
             f"brightest 1 % from {100 * dark:.0f} to {100 * bright:.0f} % of the white level, at"
-            " most"
-            f" {100 * exposure['saturated']:.1f} % of an image saturated",
+            f" most {100 * exposure['saturated']:.1f} % of an image saturated",
         ),
         (
             "expect",
             f"{report['expect']['memory_mib']} MiB of memory and about"
-            f" {report['expect']['seconds']} s"
-            f" on a laptop, {report['expect']['seconds_with_surface']} s with --surface",
+            f" {report['expect']['seconds']} s on a laptop,"
+            f" {report['expect']['seconds_with_surface']} s with --surface",
         ),
     ]
     if "mended_lights" in report:

@@ -97,8 +97,8 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
     lights_in_channels: bool = flag(
         "Light intensities",
         "The images of the gray ball are colour images under three coloured lamps at once:"
-        " measure the crosstalk. BALL then contains one image under each lamp alone, in the"
-        " order R, G, B.",
+        " measure the crosstalk. BALL then contains one image under each lamp alone, in the order"
+        " R, G, B.",
     )
     transfer: str = option(
         "Light intensities",
@@ -206,10 +206,10 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
     )
     prior: Path | None = option(
         "Input",
-        "Depth map of the same view from elsewhere, such as a scan: the surface takes its"
-        " overall shape from it, and the detail from the normals. .npy, .tif or .exr, with"
-        " heights towards the camera in the unit of the result, or with depths in millimetres"
-        " for a perspective camera. NaN is unknown.",
+        "Depth map of the same view from elsewhere, such as a scan: the surface takes its overall"
+        " shape from it, and the detail from the normals. .npy, .tif or .exr, with heights"
+        " towards the camera in the unit of the result, or with depths in millimetres for a"
+        " perspective camera. NaN is unknown.",
         "FILE",
     )
     discontinuity: NotNegative | None = option(
@@ -232,8 +232,8 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
     )
     level: tuple[tuple[int, int], ...] | None = option(
         "Method",
-        "Level the surface, and write its normals: plane removes the slope of"
-        " its dominant plane; three or"
+        "Level the surface, and write its normals: plane removes the slope of its dominant plane;"
+        " three or"
         ' more pixels "X,Y X,Y X,Y" define the plane that becomes level.',
         "plane|POINTS",
         parse=parse_level,
@@ -243,8 +243,8 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
     )
     formats: tuple[str, ...] = option(
         "Output",
-        f"Files to write, any of {', '.join(SURFACE_FILES)}: meshes, and depth maps in float32"
-        " or as a 16-bit picture (png). exr needs the extra 'exr'.",
+        f"Files to write, any of {', '.join(SURFACE_FILES)}: meshes, and depth maps in float32 or"
+        " as a 16-bit picture (png). exr needs the extra 'exr'.",
         "LIST",
         value=DEFAULT_FORMATS,
         names="--format",
@@ -252,8 +252,8 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
     )
     decimate: Count | None = option(
         "Output",
-        "Reduce the mesh to N triangles; a texture of the normals keeps the detail in GLB"
-        " (needs the extra 'mesh').",
+        "Reduce the mesh to N triangles; a texture of the normals keeps the detail in GLB (needs"
+        " the extra 'mesh').",
         "N",
         "all",
     )

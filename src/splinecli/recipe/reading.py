@@ -143,8 +143,8 @@ def _dark_images(dark: Sequence[ImageSummary], observed: Observed) -> CaptureWar
     if level and used >= DARK:
         text = (
             f"No value is above {level}, as from a camera of {bits} bits in 16-bit files. Of this"
-            f" range, the images use {100 * min(used, 1):.0f} %. If the camera has {bits} bits, add"
-            f" --white-level {level}; if it has 16, a longer exposure gives less noise."
+            f" range, the images use {100 * min(used, 1):.0f} %. If the camera has {bits} bits,"
+            f" add --white-level {level}; if it has 16, a longer exposure gives less noise."
         )
         return CaptureWarning(codes.WHITE_LEVEL, text)
     text = (

@@ -91,8 +91,8 @@ def register(work: Work, advance: Callable[[], object]) -> Work:
         )
         if share < 1:
             text += (
-                f"; {100 - 100 * share:.1f} % of the object is left out, because it is not in every"
-                " image"
+                f"; {100 - 100 * share:.1f} % of the object is left out, because it is not in"
+                " every image"
             )
         warnings = (*warnings, CaptureWarning(IMAGES_ALIGNED, f"{text}."))
     aligned = AlignedImages(names[0], found.model, transforms, moved, common)

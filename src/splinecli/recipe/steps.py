@@ -164,7 +164,7 @@ def divide_by_intensities(work: Work, _: Callable[[], object]) -> Work:
     lowest, highest = intensities.min(), intensities.max()
     digits = 4 if f"{lowest:.2f}" == f"{highest:.2f}" else 2
     text = (
-        f"The light intensities were estimated from the images: they are unequal, from"
+        "The light intensities were estimated from the images: they are unequal, from"
         f" {lowest:.{digits}f} to {highest:.{digits}f} times their mean. Use --intensities FILE if"
         " you have measured them, or --intensities equal to assume equal ones."
     )

@@ -144,8 +144,8 @@ IMAGE_INCONSISTENT = fault(
 )
 IMAGE_SCALE = fault(
     "image_scale",
-    "One image is 16, 64 or 256 times darker or brighter than the others predict, as with a 12-bit"
-    " image among 16-bit ones",
+    "One image is 16, 64 or 256 times darker or brighter than the others predict, as with a"
+    " 12-bit image among 16-bit ones",
     "Save all images with the same bit depth",
 )
 IMAGES_ALIGNED = WarningKind(
@@ -285,8 +285,8 @@ SATURATED = WarningKind(
 )
 UNEQUAL_INTENSITIES = fault(
     "unequal_intensities",
-    "Light intensities look unequal, but the images do not determine them; or given intensities do"
-    " not fit the images",
+    "Light intensities look unequal, but the images do not determine them; or given intensities"
+    " do not fit the images",
     "[Measure them](capture-and-calibrate.md#light-intensities), or correct the file",
 )
 UNTRAINED_LIGHTS = WarningKind(

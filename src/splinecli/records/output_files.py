@@ -159,8 +159,8 @@ _ROWS = (
     OutputMap(
         name="curvature",
         content="mean and Gaussian curvature from the normals, filtered with 2 pixels; float32, H"
-        " x W x 2, in 1/pixel and 1/pixel^2. Bumps are positive. The picture shows the"
-        " mean curvature: gray is 0, white 0.05 per pixel",
+        " x W x 2, in 1/pixel and 1/pixel^2. Bumps are positive. The picture shows the mean"
+        " curvature: gray is 0, white 0.05 per pixel",
         unit="mean and Gaussian curvature, 1/pixel and 1/pixel^2",
         scale=0.05,
         scale_text="mean curvature, black -{scale}, gray 0, white {scale} per pixel",
@@ -178,8 +178,8 @@ _ROWS = (
     OutputMap(
         name="material",
         content="base colour, roughness, metalness, specular reflection and their confidence;"
-        " float32, zero outside the mask. The pictures have 8 bits: base colour in sRGB,"
-        " and glTF's texture with roughness in green and metalness in blue",
+        " float32, zero outside the mask. The pictures have 8 bits: base colour in sRGB, and"
+        " glTF's texture with roughness in green and metalness in blue",
         reads_images=True,
         bytes_per_pixel=170,  # the maps, and the gloss of each pixel
         bytes_per_observation=5,

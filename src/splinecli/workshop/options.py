@@ -29,8 +29,8 @@ class PrepareOptions(Display, frozen=True, kw_only=True):
     scenes: Natural = option("Scenes", "Render N random scenes.", "N", value=0)
     groups: Natural = option(
         "Scenes",
-        "Render N random groups of bodies. The meshes are among the bodies, and rendered alone only"
-        " with --views.",
+        "Render N random groups of bodies. The meshes are among the bodies, and rendered alone"
+        " only with --views.",
         "N",
         value=0,
     )

@@ -231,8 +231,8 @@ def test_one_ball(directions):
     assert found["warnings"] == []
     assert found["balls"][0]["highlights"][0] == [1.235, 2.0]
     assert calibration_lines(found) == [
-        "ball: circle 50.0, 40.0, radius 30.0 pixels (from --circle, 100 % of the outline visible,"
-        " spread 0.0 pixels)"
+        "ball: circle 50.0, 40.0, radius 30.0 pixels (from --circle, 100 % of the outline"
+        " visible, spread 0.0 pixels)"
     ]
 
 

@@ -150,8 +150,8 @@ def decode_with_alpha(
         length, most = os.fstat(file.fileno()).st_size, image_bytes(*size) + (1 << 26)
         if length > most:
             raise InputError(
-                f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image of"
-                " this size",
+                f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image"
+                " of this size",
                 path,
             )
         file.seek(0)

@@ -204,8 +204,8 @@ def _check_lengths(stored: Array, mask: Bools, path: Path) -> None:
     share = float((np.abs(length[usable] - 1) < 0.1).mean())
     if share < 0.6:
         problem = (
-            f"found {100 * share:.0f} % of the pixels to be unit vectors (in a picture colour * 2 -"
-            " 1), expected"
+            f"found {100 * share:.0f} % of the pixels to be unit vectors (in a picture colour * 2"
+            " - 1), expected"
         )
         raise InputError(
             f"{problem} nearly all: these are not normals",

@@ -143,8 +143,8 @@ METHODS: dict[str, Method] = {
     ),
     "ls-trimmed": Method(
         partial(_fit, solve="least_squares:solve_trimmed"),
-        "the same without the darkest and brightest fifth of each pixel's observations and without"
-        " shadows",
+        "the same without the darkest and brightest fifth of each pixel's observations and"
+        " without shadows",
     ),
     "l1": Method(
         partial(_fit, solve="least_squares:solve_l1"), "sum of absolute residuals of I = L b"
@@ -161,8 +161,8 @@ METHODS: dict[str, Method] = {
     ),
     "ia14": Method(
         partial(_fit, solve="ia14:solve_ia14", batch_size=1024),
-        "n.l as a monotone Bernstein polynomial of the observation and l.v;"
-        " one quadratic programme for each pixel",
+        "n.l as a monotone Bernstein polynomial of the observation and l.v; one quadratic"
+        " programme for each pixel",
         "Ikehata and Aizawa, CVPR 2014",
     ),
     "spline-net-pixelwise": Method(

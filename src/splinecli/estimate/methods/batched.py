@@ -237,8 +237,8 @@ class NetworkEstimator(_InBatches):
             self.fingerprint += f" with a context of up to {SAMPLE} pixels, outline {_COVERED}"
         if self.refiner is not None:
             self.fingerprint += (
-                f", without indirect light, refined in {self.refiner.turns} turns, halved,"
-                " with detail"
+                f", without indirect light, refined in {self.refiner.turns} turns, halved, with"
+                " detail"
             )
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
         self._contexts: list[CaptureContext | None] = [

@@ -125,8 +125,8 @@ class NetworkConfig:
         for fit in config.fits:
             if fit not in STARTING_FITS:
                 raise ModelError(
-                    f"network setting 'fits' has {fit!r};"
-                    f" expected a list of {', '.join(STARTING_FITS)}"
+                    f"network setting 'fits' has {fit!r}; expected a list of"
+                    f" {', '.join(STARTING_FITS)}"
                 )
         compact_only = ("fits", "error_head", "set_width")
         wrong = {

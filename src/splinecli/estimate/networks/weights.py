@@ -98,8 +98,8 @@ def resolve_weights(name_or_file: str) -> LoadedNetwork:
         if path.suffix != ".safetensors" and path.parent == Path() and not os.path.exists(path):  # noqa: PTH110
             names = ", ".join(shipped_names())
             raise ModelError(
-                f"no weights named {name_or_file!r}; expected one of {names},"
-                " or a .safetensors file"
+                f"no weights named {name_or_file!r}; expected one of {names}, or a .safetensors"
+                " file"
             )
         return load_weights(path)
     with resources.as_file(SHIPPED / entry["file"]) as path:

@@ -305,8 +305,8 @@ def calibrate_ball(
             normal, direction = reflect(centre, point, view.matrix)
             if not direction[0] @ unit_rays(point, view.matrix)[0] < 0:
                 raise InputError(
-                    "the highlight is near the rim of the ball: the lamp is level with the ball or"
-                    " behind it",
+                    "the highlight is near the rim of the ball: the lamp is level with the ball"
+                    " or behind it",
                     hint="Place all lights on the camera's side of the object",
                 )
         except InputError as error:

@@ -260,8 +260,7 @@ class ScenePlan:
                 "the camera sees nothing of the mesh",
                 path=mesh_file or self.names[position],
                 hint="The camera looks along -z. A face is visible if its corners are"
-                " counter-clockwise"
-                " as seen from the camera",
+                " counter-clockwise as seen from the camera",
             )
         normals, lights = rendered.normals.astype(np.float32), scene.lights.astype(np.float32)
         # float16 has a relative precision of 0.05 %, finer than the noise of the rendering.

@@ -102,8 +102,7 @@ class TrainingConfig:
         ) and self.updates != "refine_net":
             raise ModelError(
                 f"training setting 'batch_size' is {self.batch_size}; expected a multiple of"
-                " shards * capture_pixels ="
-                f" {self.shards * lights.capture_pixels}, or fewer"
+                f" shards * capture_pixels = {self.shards * lights.capture_pixels}, or fewer"
             )
         if not lights.min_lights <= lights.usual_lights <= lights.max_lights:
             raise ModelError(

@@ -311,8 +311,8 @@ class RefinementTask:
         self.generator = torch.Generator()
         if config.sources.get(GENERATOR, 0) > 0:
             raise UsageError(
-                "the refinement net learns from pixel sets of rendered scenes,"
-                " and the sources name the pixel generator",
+                "the refinement net learns from pixel sets of rendered scenes, and the sources"
+                " name the pixel generator",
                 hint=(
                     "Run splinecli prepare --scenes 60 -o SET, then splinecli train SET --preset"
                     " refine"
