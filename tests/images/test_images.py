@@ -16,13 +16,8 @@ from scenes import Floats, shade, sphere_cap, spiral_lights, to_uint16, with_chu
 from splinecli.capture.formats.images import decode_image, to_linear
 from splinecli.capture.reader import CaptureOptions, open_capture
 from splinecli.errors import InputError
-from splinecli.images.saturation import (
-    Saturation,
-    find_object,
-    find_saturated,
-    look_at,
-    restore_saturated,
-)
+from splinecli.images.mask import find_object
+from splinecli.images.saturation import Saturation, find_saturated, look_at, restore_saturated
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.recipe import RecipeOptions, prepare_capture
 from splinecli.records.white_level import WhiteLevel

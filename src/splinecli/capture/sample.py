@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splinecli.errors import InputError
-from splinecli.images.saturation import find_object
+from splinecli.images.mask import find_object
 from splinecli.maths import Bools, Floats
 
 MAX_PIXELS = 20_000  # larger captures are subsampled by 2, 3 and so on

@@ -38,7 +38,7 @@ from splinecli.capture.near_lamps import LampFiles, NearLamps, check_distances, 
 from splinecli.capture.record import check_light_indices
 from splinecli.errors import InputError, UsageError
 from splinecli.images.alignment import AlignedImages, resample
-from splinecli.images.saturation import looks_inverted, surrounds_hole
+from splinecli.images.mask import looks_inverted, surrounds_hole
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Integers
 from splinecli.records.capture_warnings import (
     GROUND_TRUTH_UPSIDE_DOWN,

@@ -23,12 +23,7 @@ from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.sample import Sample
 from splinecli.maths import Float64Array
 from splinecli.maths.normals import angle_between_deg, spread_of, unit
-from splinecli.maths.robust import (
-    absolute_weights,
-    inverse_3x3,
-    lit_values,
-    multiply_symmetric,
-)
+from splinecli.maths.robust import absolute_weights, inverse_3x3, lit_values, multiply_symmetric
 
 Kind = Literal["curve", "near", "offset", "intensities"]
 ALL_KINDS: tuple[Kind, ...] = get_args(Kind)

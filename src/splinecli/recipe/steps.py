@@ -23,7 +23,8 @@ from splinecli.capture.source import Source
 from splinecli.errors import InputError
 from splinecli.images.lamps import estimate_light_intensities, lamp_colours
 from splinecli.images.lens_blur import remove_blur, surroundings
-from splinecli.images.saturation import find_object, restore_saturated
+from splinecli.images.mask import find_object
+from splinecli.images.saturation import restore_saturated
 from splinecli.judge.checks import check_capture
 from splinecli.lights.light_fit import refine_capture
 from splinecli.maths import Float64Array

@@ -16,13 +16,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from splinecli.materials.lobes import (
-    facets,
-    half_vector_cosines,
-    power,
-    schlick_weight,
-    smith_ggx,
-)
+from splinecli.materials.lobes import facets, half_vector_cosines, power, schlick_weight, smith_ggx
 
 
 @dataclass(frozen=True)
