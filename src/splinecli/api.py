@@ -122,6 +122,7 @@ def estimate_normals(  # noqa: PLR0913 - keyword arguments suit a notebook
     from splinecli.pipeline.infer import estimate_capture
     from splinecli.recipe.steps import begin, follow
     from splinecli.recipe.work import RecipeOptions
+    from splinecli.records.capture_warnings import LIGHTS_MENDED
 
     check_method(method)
     if first_light is not None and light_directions is not None:
@@ -139,15 +140,16 @@ def estimate_normals(  # noqa: PLR0913 - keyword arguments suit a notebook
     )
     recipe = RecipeOptions(
         as_stored=as_stored,
+        mends=not as_stored,
         finds_lights=light_directions is None,
         first_light=None if first_light is None else str(first_light),
     )
     work = follow(begin(source, options=recipe), last="saturation")
     options = MethodOptions(weights, rotations, batch_size, device, precision)
     estimator = make_estimator(method, options)
-    estimate, _ = estimate_capture(work, lambda: estimator, distil=distil, progress=progress)
+    estimate, _, _ = estimate_capture(work, lambda: estimator, distil=distil, progress=progress)
     for warning in estimate.capture.warnings:
-        if warning.is_error:
+        if warning.is_error or warning.kind is LIGHTS_MENDED:
             warn(str(warning), stacklevel=2)
     return estimate
 

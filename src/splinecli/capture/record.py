@@ -56,6 +56,11 @@ def azimuth_of(first_light: str) -> float:
     return azimuth
 
 
+def side_of(azimuth_deg: float) -> str:
+    """Return the side of the image that is nearest to an azimuth, such as `upper-left`."""
+    return min(SIDES_DEG, key=lambda side: abs((SIDES_DEG[side] - azimuth_deg + 180) % 360 - 180))
+
+
 def placeholders(n_lights: int) -> Float64Array:
     """Return arbitrary directions (F, 3) that give normals, as placeholders until the lights are
     estimated.
@@ -103,6 +108,7 @@ class Capture:
             the image on the object's mean plane. None for distant lights.
         camera_matrix: (3, 3) float64, in pixels of the mask, as in OpenCV. None is an orthographic
             camera. Near lamps have their own.
+        mended: the codes of the faults that were clear and were mended.
 
     Raises:
         InputError: the shapes disagree, a value is not finite, a light is not a unit vector above
@@ -126,6 +132,7 @@ class Capture:
     lamps: NearLamps | None = None
     light_errors_deg: Float64Array | None = None
     camera_matrix: Float64Array | None = None
+    mended: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         # The record is frozen, so its fields get their dtypes here; those that have them are not

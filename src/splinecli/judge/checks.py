@@ -9,13 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from splinecli.capture import Capture
+from splinecli.capture.record import side_of
 from splinecli.capture.sample import leave_out_background
 from splinecli.capture.source import Source
 from splinecli.errors import InputError
 from splinecli.images.lamps import estimate_light_intensities
 from splinecli.judge.evidence import Evidence
-from splinecli.judge.explanations import LIKELY, SRGB_EXPONENT, Explanation, Kind
-from splinecli.judge.light_check import LightCheck, light_warnings
+from splinecli.judge.explanations import LIKELY, SRGB_EXPONENT, Doubt, Explanation, Kind
+from splinecli.judge.light_check import WRITES_MENDED, LightCheck, light_warnings
 from splinecli.judge.odd_images import check_ground_truth
 from splinecli.lights.light_fit import would_refine
 from splinecli.lights.rough_normals import median_turn_deg
@@ -33,7 +34,18 @@ DECISIVE = 0.35
 _MOST_NAMED = 4  # shifted images in a sentence
 
 
-def shifted_images(seen: Evidence) -> Iterator[CaptureWarning]:
+class Finding(NamedTuple):
+    """A fault that a check found."""
+
+    warning: CaptureWarning
+    # the evidence once the fault is mended, which the next checks use; None if nothing mends it
+    after: Evidence | None = None
+    # whether the fault is so clear that it is mended without being asked
+    clear: bool = False
+    cause: str = ""  # a sentence that says why, for a fault that can be mended
+
+
+def shifted_images(seen: Evidence) -> Iterator[Finding]:
     shifts, names = seen.shifts, seen.names
     if not shifts:
         return
@@ -44,10 +56,12 @@ def shifted_images(seen: Evidence) -> Iterator[CaptureWarning]:
         f" against the others, in pixels: {named}{more}. The camera or the object moved. Add"
         " --align, or photograph from a tripod."
     )
-    yield CaptureWarning(codes.IMAGES_SHIFTED, text, seen.shift_error_deg)
+    yield Finding(
+        CaptureWarning(codes.IMAGES_SHIFTED, text, seen.shift_error_deg), seen.moved_back(shifts)
+    )
 
 
-def other_scale(seen: Evidence) -> Iterator[CaptureWarning]:
+def other_scale(seen: Evidence) -> Iterator[Finding]:
     """Warn of an image with the values of a camera of fewer bits than the files of the others."""
     values, lights = np.asarray(seen.observations, np.float64), seen.directions
     # one image may be much brighter
@@ -64,34 +78,36 @@ def other_scale(seen: Evidence) -> Iterator[CaptureWarning]:
         bits = min((4, 6, 8), key=lambda bits: abs(bits - stops))
         if abs(bits - stops) > 0.2:
             continue
-        mended = seen.observations.copy()
-        mended[:, place] /= factor
+        scales = np.ones(len(seen.names))
+        scales[place] = 1 / factor
+        mended = seen.observations * scales
         how = f"{1 / factor:.0f} times darker" if factor < 1 else f"{factor:.0f} times brighter"
         text = (
             f"{name} is {how} than the other images predict, as if it had {16 - bits} bits and the"
             " others 16, or vice versa. Save all images with the same bit depth, or scale it by"
             f" 2^{bits}."
         )
-        yield CaptureWarning(
-            codes.IMAGE_SCALE, text, median_turn_deg(seen.observations, lights, lights, mended)
-        )
+        error_deg = median_turn_deg(seen.observations, lights, lights, mended)
+        seen = seen.scaled(scales)
+        yield Finding(CaptureWarning(codes.IMAGE_SCALE, text, error_deg), seen)
 
 
-def odd_image(seen: Evidence) -> list[CaptureWarning]:
+def odd_image(seen: Evidence) -> Iterator[Finding]:
     """Warn of an image that contradicts the others, and is not only shifted."""
     for name, largest in zip(seen.names, seen.sample.observations.max(axis=0), strict=True):
         if largest <= 0:
             text = (
                 f"{name} is black: its lamp probably failed. Photograph it again, or leave it out."
             )
-            return [
-                CaptureWarning(
-                    codes.IMAGE_INCONSISTENT, text, _turn_by_deg(seen, [seen.names.index(name)])
-                )
-            ]
+            place = seen.names.index(name)
+            error_deg = _turn_by_deg(seen, [place])
+            yield Finding(
+                CaptureWarning(codes.IMAGE_INCONSISTENT, text, error_deg), seen.without(place)
+            )
+            return
     odd = seen.light_check.odd_image
-    if odd is None or odd.place in [shift.place for shift in seen.shifts]:
-        return []
+    if odd is None or odd.place in seen.moved:
+        return
     how = (
         ""
         if odd.brightness is None
@@ -103,7 +119,10 @@ def odd_image(seen: Evidence) -> list[CaptureWarning]:
         " differ, or a shadow may have fallen on the object. Photograph it again, or leave it"
         " out."
     )
-    return [CaptureWarning(codes.IMAGE_INCONSISTENT, text, _turn_by_deg(seen, [odd.place]))]
+    error_deg = _turn_by_deg(seen, [odd.place])
+    yield Finding(
+        CaptureWarning(codes.IMAGE_INCONSISTENT, text, error_deg), seen.without(odd.place)
+    )
 
 
 def _turn_by_deg(seen: Evidence, places: list[int]) -> float | None:
@@ -117,17 +136,17 @@ def _turn_by_deg(seen: Evidence, places: list[int]) -> float | None:
     return median_turn_deg(observations, lights, lights[others], observations[:, others])
 
 
-def missing_mask(seen: Evidence) -> Iterator[CaptureWarning]:
+def missing_mask(seen: Evidence) -> Iterator[Finding]:
     if seen.background > 0.5:  # the share of near black pixels
         text = (
             f"{100 * seen.background:.0f} % of the pixels are nearly black. If they are"
             " background, their normals"
         )
         text += " are meaningless: add --auto-mask, or give a mask."
-        yield CaptureWarning(codes.NO_MASK, text)
+        yield Finding(CaptureWarning(codes.NO_MASK, text))
 
 
-def crowded_lights(seen: Evidence) -> Iterator[CaptureWarning]:
+def crowded_lights(seen: Evidence) -> Iterator[Finding]:
     spread, in_cone = light_spread(seen.directions)
     if spread < 0.1:  # see light_spread; such lights determine the normals poorly
         where = "in a narrow cone" if in_cone else "nearly in one plane with the object"
@@ -136,10 +155,10 @@ def crowded_lights(seen: Evidence) -> Iterator[CaptureWarning]:
             " factor of about"
         )
         text += f" {1 / max(spread, 1e-3):.0f} in the normals. Add lights from other sides."
-        yield CaptureWarning(codes.LIGHTS_ILL_CONDITIONED, text)
+        yield Finding(CaptureWarning(codes.LIGHTS_ILL_CONDITIONED, text))
 
 
-def same_images(seen: Evidence) -> Iterator[CaptureWarning]:
+def same_images(seen: Evidence) -> Iterator[Finding]:
     pairs = sorted({*repeated_images(seen.sample.observations), *seen.copies})
     differ = "" if seen.found else ", but their lights differ"
     if differ:
@@ -156,69 +175,133 @@ def same_images(seen: Evidence) -> Iterator[CaptureWarning]:
         errors_deg = [
             error for places in wrong if (error := _turn_by_deg(seen, places)) is not None
         ]
-        yield CaptureWarning(codes.REPEATED_IMAGES, text, max(errors_deg, default=None))
+        yield Finding(CaptureWarning(codes.REPEATED_IMAGES, text, max(errors_deg, default=None)))
 
 
-def rough_lights(seen: Evidence) -> list[CaptureWarning]:
+def wrong_lights(seen: Evidence) -> Iterator[Finding]:
+    """Warn of lights in another frame or order."""
+    check = seen.light_check
+    mended = None if check.mended is None else seen.under_lights(check.mended)
+    for warning, cause in light_warnings(check, seen.origin, seen.frame, seen.strict):
+        yield Finding(warning, mended if cause else None, check.is_clear, cause)
+
+
+def tilted_lights(seen: Evidence) -> Iterator[Finding]:
+    """Warn of lights that are all tilted together."""
+    tilt = seen.tilt
+    if seen.has_positions or tilt is None or not tilt.is_likely(seen.factors, seen.directions):
+        return
+    mended = seen.directions @ tilt.matrix.T
+    cause = (
+        f"The lights of {seen.origin.name} look tilted together, by {tilt.degrees:.0f} degrees"
+        f" towards the {side_of(tilt.towards_deg)}: tilted back, they give normals that fit a"
+        f" surface better (curl {tilt.left * tilt.curl:.3f} against {tilt.curl:.3f})."
+    )
+    text = (
+        f"{cause} They may have been measured in another frame than the camera's, such as the"
+        f" table's. Tilt them back, as {WRITES_MENDED} does."
+    )
+    error_deg = median_turn_deg(seen.observations, seen.directions, mended)
+    warning = CaptureWarning(codes.LIGHTS_TILTED, text, error_deg)
+    yield Finding(warning, seen.under_lights(mended), tilt.is_clear, cause)
+
+
+def rough_lights(seen: Evidence) -> Iterator[Finding]:
     """Suggest refining the lights if this makes them fit much better."""
     if (
         seen.has_positions
         or (refined := would_refine(seen.observations, seen.factors, seen.directions)) is None
     ):
-        return []
+        return
     moved_deg = angle_between_deg(refined.directions, seen.directions)
     text = (
         f"The light directions are probably inaccurate: moving them by {moved_deg.mean():.1f}"
         f" degrees on average reduces the residual to {100 * refined.fit_ratio:.0f} %. Try"
         " --refine-lights."
     )
-    return [CaptureWarning(codes.ROUGH_LIGHTS, text)]
+    yield Finding(CaptureWarning(codes.ROUGH_LIGHTS, text))
 
 
-def other_readings(seen: Evidence, largest_ratio: float = 1.0) -> list[CaptureWarning]:
+def decisive_readings(seen: Evidence) -> Iterator[Finding]:
+    """Warn of images that other readings explain so much better that lights and images must belong
+    together.
+    """
+    return other_readings(seen, DECISIVE)
+
+
+def other_readings(seen: Evidence, largest_ratio: float = 1.0) -> Iterator[Finding]:
     """Warn of images that fit much better if they are read in another way; see explanations.py.
 
-    Readings that leave more than the largest ratio of the residual are not named.
+    Each reading is accepted before the others are asked again. Readings that leave more than the
+    largest ratio of the residual are not named.
     """
-    if seen.doubt is None or seen.doubt.probability < LIKELY:
-        return []
-    reading = seen.doubt.reading
-    if reading.ratio > largest_ratio or (reading.kind == "intensities" and largest_ratio < 1):
-        return []
-    if reading.kind == "intensities" and seen.intensities is None:
-        observations = np.asarray(seen.observations, np.float32)
-        if estimate_light_intensities(observations, None, seen.directions) is not None:
-            return []  # `infer` estimates them, and reports it
-    error_deg = seen.explanations.error_deg(reading, seen.estimated)
+    while (doubt := seen.doubt) is not None and doubt.probability >= LIKELY:
+        reading = doubt.reading
+        if reading.ratio > largest_ratio or (reading.kind == "intensities" and largest_ratio < 1):
+            return
+        after = seen.read_as(reading)
+        error_deg = seen.explanations.error_deg(reading, seen.estimated)
+        found = _words(seen, doubt)
+        if found is not None:
+            kind, cause, advice = found
+            warning = CaptureWarning(kind, f"{cause} {advice}", error_deg)
+            clear = doubt.is_clear and kind in (codes.NONLINEARITY_SUSPECTED,)
+            yield Finding(warning, after, clear, cause)
+        seen = after
+
+
+def _words(seen: Evidence, doubt: Doubt) -> tuple[WarningKind, str, str] | None:
+    """Return the warning of another reading: its kind, the cause, and what to do; None if `infer`
+    reads the images so anyway.
+    """
+    reading = doubt.reading
     left = f"the residual falls to {100 * reading.ratio:.0f} %"
-    if seen.doubt.others:
-        causes = " and ".join(_CAUSES[kind] for kind in seen.doubt.others)
+    if doubt.others:
+        causes = " and ".join(_CAUSES[kind] for kind in doubt.others)
         left += f", although {causes} would explain the images nearly as well"
     if reading.kind == "curve":
-        text = (
-            "The images look display-encoded but are read as linear: if their values are decoded,"
-            f" {left}. Add --transfer"
-            f" srgb{'' if reading.amount == SRGB_EXPONENT else f' or gamma:{reading.amount:g}'}."
-        )
-        return [CaptureWarning(codes.NONLINEARITY_SUSPECTED, text, error_deg)]
+        curve = "srgb" if reading.amount == SRGB_EXPONENT else f"srgb or gamma:{reading.amount:g}"
+        cause = "The images look display-encoded but are read as linear: if their values are"
+        return codes.NONLINEARITY_SUSPECTED, f"{cause} decoded, {left}.", f"Add --transfer {curve}."
     if reading.kind == "near":
-        text = (
+        cause = (
             f"The lamps look near, about {reading.amount:.1f} widths of the object away, but are"
-            f" treated as distant: at this distance, {left}. Measure the distance and the width of"
-            f" the object, or try --light-distance {reading.amount:.1f} --object-width 1."
+            f" treated as distant: at this distance, {left}."
         )
-        return [CaptureWarning(codes.NEAR_LIGHTS_SUSPECTED, text, error_deg)]
+        advice = (
+            "Measure the distance and the width of the object, or try --light-distance"
+            f" {reading.amount:.1f} --object-width 1."
+        )
+        return codes.NEAR_LIGHTS_SUSPECTED, cause, advice
     if reading.kind == "offset":
-        text = (
+        cause = (
             "All images look as if they contained ambient light, or a black level that was not"
-            f" subtracted: {100 * reading.amount:.0f} % of the light of a lamp. Without it,"
-            f" {left}. Photograph the object with all lamps off and give this image with"
-            " --ambient."
+            f" subtracted: {100 * reading.amount:.0f} % of the light of a lamp. Without it, {left}."
         )
-        return [CaptureWarning(codes.CONSTANT_LIGHT, text, error_deg)]
-    return [
-        CaptureWarning(codes.UNEQUAL_INTENSITIES, _intensities_text(seen, reading, left), error_deg)
-    ]
+        advice = "Photograph the object with all lamps off and give this image with --ambient."
+        return codes.CONSTANT_LIGHT, cause, advice
+    if reading.kind == "elevation":
+        how = "low" if reading.amount > 1 else "high"
+        cause = (
+            f"The lights of {seen.origin.name} look too {how}: with their z multiplied by"
+            f" {reading.amount:g}, {left}."
+        )
+        return (
+            codes.ELEVATION_SUSPECTED,
+            cause,
+            f"Correct their elevations, as {WRITES_MENDED} does.",
+        )
+    observations = np.asarray(seen.observations, np.float32)
+    if seen.intensities is not None:
+        return codes.UNEQUAL_INTENSITIES, *_of_given_intensities(seen.intensities, reading, left)
+    if estimate_light_intensities(observations, None, seen.directions) is not None:
+        return None  # `infer` estimates them, and reports it
+    cause = f"The lights seem to differ in intensity: with other intensities, {left}."
+    advice = (
+        "The images do not determine them, so equal ones are assumed. Measure them with calibrate"
+        " --gray-card, or give them with --intensities FILE."
+    )
+    return codes.UNEQUAL_INTENSITIES, cause, advice
 
 
 _CAUSES: dict[Kind, str] = {
@@ -226,17 +309,12 @@ _CAUSES: dict[Kind, str] = {
     "near": "near lamps (--light-distance)",
     "offset": "ambient light (--ambient)",
     "intensities": "unequal intensities (--intensities)",
+    "elevation": "wrong elevations of the lights",
 }
 
 
-def _intensities_text(seen: Evidence, reading: Explanation, left: str) -> str:
-    given = seen.intensities
-    if given is None:
-        return (
-            f"The lights seem to differ in intensity: with other intensities, {left}. The images"
-            " do not determine them, so equal ones are assumed. Measure them with calibrate"
-            " --gray-card, or give them with --intensities FILE."
-        )
+def _of_given_intensities(given: Float64Array, reading: Explanation, left: str) -> tuple[str, str]:
+    """Return in words why given intensities (F,) are wrong, and what to do."""
     needed = np.log(given * reading.intensities)
     ways = {
         "if they are left out": np.zeros_like(given),
@@ -251,41 +329,44 @@ def _intensities_text(seen: Evidence, reading: Explanation, left: str) -> str:
         if errors[words] < 0.4 * np.std(np.log(reading.intensities))
         else ""
     )
-    return (
-        f"The given light intensities do not fit the images: with others{how}, {left}. Check that"
-        " their file is in the order of the images, or leave them out with --intensities equal."
+    cause = f"The given light intensities do not fit the images: with others{how}, {left}."
+    advice = (
+        "Check that their file is in the order of the images, or leave them out with --intensities"
+        " equal."
     )
+    return cause, advice
 
 
-def few_lights(seen: Evidence) -> list[CaptureWarning]:
+def few_lights(seen: Evidence) -> list[Finding]:
     """Warn of fewer lights than eight, unless they are channels: one colour image has three."""
     count = len(seen.names)
     few = count < 8 and not seen.in_channels
-    return [
-        CaptureWarning(codes.FEW_LIGHTS, f"There are {count} lights; use 8 or more, well spread.")
-    ] * few
+    text = f"There are {count} lights; use 8 or more, well spread."
+    return [Finding(CaptureWarning(codes.FEW_LIGHTS, text))] * few
 
 
-def lights_near_axis(seen: Evidence) -> list[CaptureWarning]:
+def lights_near_axis(seen: Evidence) -> list[Finding]:
     """Warn of lights that all shine from near the camera."""
     if np.degrees(np.arccos(seen.directions[:, 2].clip(-1, 1))).max() >= 25:
         return []
     text = "All lights are within 25 degrees of the camera axis; lower lights give better normals."
-    return [CaptureWarning(codes.LIGHTS_NEAR_AXIS, text)]
+    return [Finding(CaptureWarning(codes.LIGHTS_NEAR_AXIS, text))]
 
 
-REPEATED = frozenset({codes.REPEATED_IMAGES})  # if the lights differ, these contradict all others
-# After these warnings, no check that relies on the lights is reliable.
-DOUBTED = REPEATED | {
-    codes.IMAGES_SHIFTED,
-    codes.IMAGE_INCONSISTENT,
-    codes.LIGHT_ORDER,
-    codes.LIGHT_FRAME,
-    codes.LIGHTS_ILL_CONDITIONED,
-}
-# After these warnings, the normals do not determine the lights' frame, nor the images their order.
-READ_OTHERWISE = frozenset(
-    {codes.NONLINEARITY_SUSPECTED, codes.NEAR_LIGHTS_SUSPECTED, codes.CONSTANT_LIGHT}
+def wrong_truth(seen: Evidence) -> Iterator[Finding]:
+    """Warn of a ground truth that does not fit."""
+    for warning in check_ground_truth(seen.evened, seen.directions, seen.truth):
+        yield Finding(warning)
+
+
+# With these faults, no check that relies on the lights is reliable, unless they are mended.
+DOUBTED = frozenset(
+    {
+        codes.REPEATED_IMAGES,
+        codes.LIGHT_ORDER,
+        codes.LIGHT_FRAME,
+        codes.LIGHTS_ILL_CONDITIONED,
+    }
 )
 
 
@@ -293,30 +374,38 @@ READ_OTHERWISE = frozenset(
 class Check:
     """A row of CHECKS."""
 
-    find: Callable[[Evidence], Iterable[CaptureWarning]]
-    unless: frozenset[WarningKind] = frozenset()  # earlier warnings after which it is skipped
-    needs_lights: bool = True  # whether it is skipped if the lights were estimated from the images
+    find: Callable[[Evidence], Iterable[Finding]]
+    needs_lights: bool = True  # whether it is skipped if the lights are not to be relied on
 
 
-# The checks of a capture's lights and images, in their order
+# The checks of a capture's lights and images, in their order. Each uses the evidence in which the
+# faults before it are mended.
 CHECKS = [
     Check(same_images, needs_lights=False),
-    Check(lambda seen: other_readings(seen, DECISIVE), REPEATED),
-    Check(shifted_images, READ_OTHERWISE, needs_lights=False),
-    Check(other_scale, REPEATED),
-    Check(odd_image, REPEATED | {codes.IMAGE_SCALE}),
-    Check(
-        lambda s: light_warnings(s.light_check, s.origin, s.frame, s.strict),
-        REPEATED | READ_OTHERWISE,
-    ),
+    Check(decisive_readings),
+    Check(shifted_images, needs_lights=False),
+    Check(other_scale),
+    Check(odd_image),
+    Check(wrong_lights),
     Check(missing_mask, needs_lights=False),
     Check(few_lights, needs_lights=False),
     Check(lights_near_axis),
     Check(crowded_lights),
-    Check(lambda seen: check_ground_truth(seen.evened, seen.directions, seen.truth), DOUBTED),
-    Check(other_readings, DOUBTED | READ_OTHERWISE),
-    Check(rough_lights, DOUBTED | READ_OTHERWISE),
+    Check(other_readings),
+    Check(tilted_lights),
+    Check(wrong_truth),
+    Check(rough_lights),
 ]
+
+
+@dataclass(frozen=True, eq=False)
+class Remedy:
+    """How a capture is read once its clear faults are mended."""
+
+    faults: tuple[Finding, ...]
+    lights: Float64Array | None = None  # (F, 3); None as given
+    curve: float | None = None  # the exponent of the transfer curve; None as given
+    align: bool = False  # whether images are aligned
 
 
 class Judgement(NamedTuple):
@@ -324,6 +413,10 @@ class Judgement(NamedTuple):
 
     warnings: tuple[CaptureWarning, ...]
     light_check: LightCheck | None  # None if the lights were estimated from the images
+    # (F, 3), the lights after all faults that were found are mended; None as given, or if an image
+    # was left out
+    mended_lights: Float64Array | None = None
+    remedy: Remedy | None = None  # of the clear faults, None if there are none
 
 
 def check_capture(source: Source, capture: Capture, *, strict: bool = False) -> Judgement:
@@ -346,13 +439,34 @@ def check_capture(source: Source, capture: Capture, *, strict: bool = False) -> 
         leave_out_background(seen.closeup),
     )
     seen = replace(seen, sample=sample, closeup=closeup, background=background)
-    warnings: list[CaptureWarning] = []
+    given, warnings = seen, list[CaptureWarning]()
+    light_check, remedy, relies = None, Remedy(()), not seen.found  # on the lights
+    clear = True
     for check in CHECKS:
-        if not (seen.found and check.needs_lights) and check.unless.isdisjoint(
-            each.kind for each in warnings
-        ):
-            warnings += check.find(seen)
-    return Judgement(tuple(warnings), None if seen.found else seen.light_check)
+        if check.needs_lights and not relies:
+            continue
+        if check.find is wrong_lights:
+            light_check = seen.light_check
+        for finding in check.find(seen):
+            warnings.append(finding.warning)
+            # A fault that was found after one that is not clear depends on that.
+            clear &= finding.clear or finding.after is None
+            seen = finding.after or seen
+            if clear and finding.clear and finding.after is not None:
+                remedy = _remedy(given, seen, (*remedy.faults, finding))
+            relies &= finding.after is not None or finding.warning.kind not in DOUBTED
+    if light_check is None and not seen.found:
+        light_check = seen.light_check
+    mended = _remedy(given, seen, ()).lights
+    return Judgement(tuple(warnings), light_check, mended, remedy if remedy.faults else None)
+
+
+def _remedy(given: Evidence, seen: Evidence, faults: tuple[Finding, ...]) -> Remedy:
+    """Return how the given evidence becomes the evidence in which faults are mended."""
+    differ = given.indices == seen.indices and (given.directions != seen.directions).any()
+    return Remedy(
+        faults, seen.directions if differ else None, seen.curve, bool(seen.moved - given.moved)
+    )
 
 
 def light_spread(light_directions: Float64Array) -> tuple[float, bool]:

@@ -16,13 +16,21 @@ from splinecli.capture.light_rows import USUAL_FRAME, LightFrame
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.sample import Sample, closeup_of, sample_observations
 from splinecli.capture.source import Source
-from splinecli.judge.explanations import Doubt, Explanations, Kind
+from splinecli.judge.explanations import (
+    Doubt,
+    Explanation,
+    Explanations,
+    Kind,
+    constant_light,
+)
 from splinecli.judge.light_check import LightCheck, check_lights
 from splinecli.judge.odd_images import ImageShift, find_shifts
 from splinecli.judge.shading_shifts import moved_back, shading_shifts
+from splinecli.judge.tilt import Tilt, find_tilt
 from splinecli.lights.light_fit import Factors, find_factors
 from splinecli.lights.rough_normals import median_turn_deg
 from splinecli.maths import Float64Array, Floats
+from splinecli.maths.normals import unit
 from splinecli.maths.robust import solve_each
 
 
@@ -53,11 +61,15 @@ class Evidence:
     origin: Path = Path("light_directions")
     frame: LightFrame = USUAL_FRAME
     linear: bool = True  # whether the values of the images are taken as linear
+    curve: float | None = None  # the exponent with which they were decoded
     truth: Floats | None = None  # (H, W, 3), the ground truth of the whole images, or None
     strict: bool = False  # also warn of properties that the images leave undetermined
     in_channels: bool = False  # whether each channel of a colour image has a light of its own
     copies: Sequence[tuple[int, int]] = ()  # places of images whose files are equal
     background: float = 0.0  # the share of dark background that was left out of the sample
+    # what was found before: other readings that were accepted, places of images moved back
+    accepted: frozenset[Kind] = frozenset()
+    moved: frozenset[int] = frozenset()
 
     @classmethod
     def of(cls, source: Source, capture: Capture, *, strict: bool = False) -> Evidence:
@@ -144,24 +156,23 @@ class Evidence:
         """The other reading that fits the images best, and its probability; None if the readings
         cannot be compared.
         """
-        kinds: set[Kind] = {"offset", "intensities"}
+        kinds: set[Kind] = {"offset", "intensities", "elevation"}
         if self.linear:
             kinds.add("curve")
         if not self.has_positions:
             kinds.add("near")
         # Estimated intensities are divided out.
-        accepted: set[Kind] = set() if self.estimated is None else {"intensities"}
-        return self.explanations.likeliest(kinds, accepted=accepted)
+        divided: set[Kind] = set() if self.estimated is None else {"intensities"}
+        return self.explanations.likeliest(kinds - self.accepted, accepted=self.accepted | divided)
+
+    @cached_property
+    def tilt(self) -> Tilt | None:
+        """The tilt of the lights that the curl of the normals shows."""
+        return find_tilt(self.evened.observations, self.evened.mask, self.directions)
 
     @cached_property
     def light_check(self) -> LightCheck:
-        """The result of comparing the images with their lights,
-        after moving shifted images back.
-        """
-        return self._check_of_moved(self.shifts) if self.shifts else self._check_as_given
-
-    @cached_property
-    def _check_as_given(self) -> LightCheck:
+        """The result of comparing the images with their lights."""
         return check_lights(
             self.observations,
             self.sample.mask,
@@ -171,35 +182,9 @@ class Evidence:
             self.factors,
         )
 
-    def _check_of_moved(self, shifts: Sequence[ImageShift]) -> LightCheck:
-        key = tuple(shifts)
-        if key not in self._checks_of_moved:
-            self._checks_of_moved[key] = self._check_moved(shifts)
-        return self._checks_of_moved[key]
-
-    def _check_moved(self, shifts: Sequence[ImageShift]) -> LightCheck:
-        known, values = moved_back(
-            replace(self.sample, observations=self.observations), self._on_grid(shifts)
-        )
-        mask = np.zeros_like(self.sample.mask)
-        mask[self.sample.mask] = known
-        factors = find_factors(values[known], intensities_known=self.intensities_measured)
-        return check_lights(
-            values[known], mask, self.all_directions, self.indices, self.names, factors
-        )
-
-    @cached_property
-    def _checks_of_moved(self) -> dict[tuple[ImageShift, ...], LightCheck]:
-        return {}
-
-    def _on_grid(self, shifts: Sequence[ImageShift]) -> dict[int, tuple[int, int]]:
-        step = self.sample.step
-        return {
-            shift.place: (round(shift.right / step), round(shift.down / step)) for shift in shifts
-        }
-
     @cached_property
     def shifts(self) -> list[ImageShift]:
+        """The images that are shifted against the others."""
         found = find_shifts(self.closeup) or (
             find_shifts(self.sample) if self.sample.step > 1 else []
         )
@@ -216,8 +201,8 @@ class Evidence:
         # The check of moved images is needed anyway, the check as given seldom.
         if (
             not of_shading
-            or self._check_of_moved(together).order is None
-            or self._check_as_given.order is None
+            or self.moved_back(together).light_check.order is None
+            or self.light_check.order is None
         ):
             return together
         return found  # the lights are in another order, so they cannot predict shading
@@ -234,6 +219,103 @@ class Evidence:
             return None
         return median_turn_deg(
             self.evened.observations[known], self.directions, self.directions, values[known]
+        )
+
+    def _on_grid(self, shifts: Sequence[ImageShift]) -> dict[int, tuple[int, int]]:
+        step = self.sample.step
+        return {
+            shift.place: (round(shift.right / step), round(shift.down / step)) for shift in shifts
+        }
+
+    @cached_property
+    def _moved(self) -> dict[tuple[ImageShift, ...], Evidence]:
+        return {}
+
+    def moved_back(self, shifts: Sequence[ImageShift]) -> Evidence:
+        """Return the evidence after these images are moved back, of the pixels that all of them
+        show.
+        """
+        key = tuple(shifts)
+        if key not in self._moved:
+            known, values = moved_back(self.sample, self._on_grid(shifts))
+            mask = np.zeros_like(self.sample.mask)
+            mask[self.sample.mask] = known
+            sample = replace(self.sample, observations=values[known], mask=mask)
+            places = frozenset(shift.place for shift in shifts)
+            self._moved[key] = replace(self, sample=sample, moved=places)
+        return self._moved[key]
+
+    def without(self, place: int) -> Evidence:
+        """Return the evidence without an image."""
+        kept = [each for each in range(len(self.names)) if each != place]
+        sample, closeup = (
+            replace(each, observations=each.observations[:, kept])
+            for each in (self.sample, self.closeup)
+        )
+        return replace(
+            self,
+            names=[self.names[each] for each in kept],
+            indices=[self.indices[each] for each in kept],
+            sample=sample,
+            closeup=closeup,
+            intensities=None if self.intensities is None else self.intensities[kept],
+            estimated=None if self.estimated is None else self.estimated[kept],
+            moved=frozenset(each - (each > place) for each in self.moved if each != place),
+            copies=(),
+        )
+
+    def under_lights(self, directions: Float64Array) -> Evidence:
+        """Return the evidence with other lights (F, 3) of the images."""
+        every = self.all_directions.copy()
+        every[list(self.indices)] = directions
+        return replace(self, all_directions=every)
+
+    def scaled(self, factors: Float64Array) -> Evidence:
+        """Return the evidence after the images are multiplied by factors (F,)."""
+        sample, closeup = (
+            replace(each, observations=each.observations * factors)
+            for each in (self.sample, self.closeup)
+        )
+        return replace(self, sample=sample, closeup=closeup)
+
+    def read_as(self, reading: Explanation) -> Evidence:
+        """Return the evidence if the images, or their lights, are read in another way."""
+        accepted = self.accepted | {reading.kind}
+        if reading.kind == "elevation":
+            lights = unit(self.directions * (1, 1, reading.amount))
+            return replace(self.under_lights(lights), accepted=accepted)
+        if reading.kind == "intensities":
+            given = np.ones(len(self.indices)) if self.intensities is None else self.intensities
+            return replace(
+                self.scaled(1 / reading.intensities),
+                accepted=accepted,
+                intensities_measured=True,
+                intensities=given * reading.intensities,
+            )
+        if reading.kind == "near":
+            width = float(np.ptp(np.flatnonzero(self.sample.mask.any(axis=0))) + 1)
+            positions = self.all_directions * reading.amount * width
+            lamps = NearLamps.of(positions, 1.0, self.sample.mask.shape, equal=True)
+            return replace(self, accepted=accepted, lamps=lamps, has_positions=True)
+        stated = 1.0 if self.intensities is None else self.intensities
+
+        def mended(sample: Sample) -> Sample:
+            stored = np.maximum(sample.observations * stated, 0)
+            if reading.kind == "curve":
+                linear = stored**reading.amount
+            else:
+                lights = self.directions * np.reshape(stated, (-1, 1))
+                linear = np.maximum(stored - constant_light(stored, lights, reading.amount), 0)
+            return replace(sample, observations=linear / stated)
+
+        sample, closeup = mended(self.sample), mended(self.closeup)
+        return replace(
+            self,
+            sample=sample,
+            closeup=closeup,
+            accepted=accepted,
+            linear=self.linear and reading.kind != "curve",
+            curve=reading.amount if reading.kind == "curve" else self.curve,
         )
 
 

@@ -1,5 +1,5 @@
-"""Other readings of the images: encoded values, near lamps, unequal intensities, and light that
-every image has.
+"""Other readings of the images and their lights: encoded values, near lamps, unequal intensities,
+light that every image has, and elevations of the lights that are all too high or too low.
 
 Any one of them can be mistaken for another, so all are fitted to the same pixels and compared
 together. A matte model is fitted under each reading, and its residual is computed in stored values.
@@ -21,19 +21,53 @@ import numpy as np
 
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.sample import Sample
-from splinecli.maths import Float64Array
+from splinecli.maths import Float64Array, Floats
 from splinecli.maths.normals import angle_between_deg, spread_of, unit
 from splinecli.maths.robust import absolute_weights, inverse_3x3, lit_values, multiply_symmetric
 
-Kind = Literal["curve", "near", "offset", "intensities"]
+Kind = Literal["curve", "near", "offset", "intensities", "elevation"]
 ALL_KINDS: tuple[Kind, ...] = get_args(Kind)
 _EXPONENTS = (1.4, 1.6, 1.8, 2.0, 2.2, 2.4, 2.6)  # of gamma curves
 SRGB_EXPONENT = 2.2  # a curve of this gamma is close to sRGB
+_HEIGHTS = (
+    0.4,
+    0.5,
+    0.6,
+    0.7,
+    0.8,
+    0.9,
+    1.12,
+    1.25,
+    1.4,
+    1.6,
+    1.8,
+    2.0,
+    2.5,
+)  # factors of z of the lights
 _WIDTHS = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 11.0)  # distances of lamps, in widths of the object
-COSTS: dict[Kind, float] = {"curve": 2.35, "near": 2.6, "offset": 3.35, "intensities": 2.75}
-POWERS: dict[Kind, float] = {"curve": 6.2, "near": 8.1, "offset": 5.7, "intensities": 2.8}
+COSTS: dict[Kind, float] = {
+    "curve": 2.35,
+    "near": 2.6,
+    "offset": 3.35,
+    "intensities": 2.75,
+    "elevation": 3.0,
+}
+POWERS: dict[Kind, float] = {
+    "curve": 6.2,
+    "near": 8.1,
+    "offset": 5.7,
+    "intensities": 2.8,
+    "elevation": 6.0,
+}
 LIKELY = 0.5  # probability from which a reading is named
-_LEAST_LIGHTS: dict[Kind, int] = {"curve": 6, "near": 6, "offset": 4, "intensities": 6}
+CLEAR = 0.95  # probability from which images are read so
+_LEAST_LIGHTS: dict[Kind, int] = {
+    "curve": 6,
+    "near": 6,
+    "offset": 4,
+    "intensities": 6,
+    "elevation": 6,
+}
 _ROWS, _COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]  # xx, yy, zz, xy, xz, yz of a product
 _SHADOW = 0.1  # of a pixel's largest value; smaller values are shadow
 
@@ -43,7 +77,8 @@ class Explanation:
     """A reading of the images, and how well it fits."""
 
     kind: Kind
-    # exponent, distance in widths of the object, or constant light; 1 for intensities
+    # exponent, distance in widths of the object, constant light, or factor of z of the lights; 1
+    # for intensities
     amount: float
     ratio: float  # residual over the given reading's, on the same observations
     evidence: float  # logarithm of its probability over the given reading's
@@ -57,6 +92,11 @@ class Doubt(NamedTuple):
     reading: Explanation
     probability: float  # that any other reading is right
     others: tuple[Kind, ...]  # kinds of readings that the images hardly distinguish from it
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether it is so likely that the images are read so without being asked."""
+        return self.probability > CLEAR and not self.others
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +156,10 @@ class Explanations:
             (free,) = _fit(self.values, vectors, free=True)
         if "near" in kinds:
             found.append(self._best_near(free))
+        if "elevation" in kinds:
+            lights = [self._with(unit(self.lights * (1, 1, height))) for height in _HEIGHTS]
+            fits = dict(zip(_HEIGHTS, _fit(self.values, np.stack(lights)[:, None]), strict=True))
+            found.append(_best("elevation", fits, given))
         if "intensities" in kinds:
             unequal = _best("intensities", {1.0: free}, given, _cost_of_equal(free.intensities))
             found.append(unequal)
@@ -317,6 +361,16 @@ def _fit_with_offsets(
     left = np.abs(stored - np.maximum(predicted, 0))[:, lit]
     found = _described(left, normals, np.ones((len(offsets), len(stored))))
     return dict(zip(offsets, found, strict=True))
+
+
+def constant_light(values: Floats, lights: Float64Array, share: float) -> Float64Array:
+    """Return the constant light (p, 1) in values (p, F), which is a share of the value of a pixel
+    that faces the light of a lamp; lights (F, 3) have any length.
+    """
+    largest = np.maximum(values.max(axis=1, keepdims=True), 1e-12)
+    scaled = np.asarray(values / largest, np.float64)
+    normals = _fit_with_offsets(scaled, lights, [share])[share].normals
+    return np.asarray(largest * share * np.linalg.norm(normals, axis=1, keepdims=True))
 
 
 def _described(

@@ -28,7 +28,7 @@ from splinecli.lights.light_fit import Factors, find_factors
 from splinecli.lights.rough_normals import RoughNormals, ShadowCheck, median_turn_deg, rough_normals
 from splinecli.maths import Bools, Float64Array, Floats, Integers
 from splinecli.records import capture_warnings as codes
-from splinecli.records.capture_warnings import CaptureWarning
+from splinecli.records.capture_warnings import CaptureWarning, WarningKind
 
 # The advantage of a frame: the weight of a difference of rims, the smallest difference that
 # distinguishes two frames, and the advantage that any rotation needs, because its angle is fitted.
@@ -103,6 +103,15 @@ class LightCheck:
                 " object)"
             )
         return missing
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the better reading is so much better that the lights are mended without being
+        asked.
+        """
+        if self.order is not None and not self.order_misfit < 0.5 * self.given_misfit:
+            return False
+        return self.mended is not None and (self.best is None or self.best.advantage >= 2)
 
     @property
     def outline_tells(self) -> bool:
@@ -334,27 +343,30 @@ def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:
     ]
 
 
-_WRITES_MENDED = "`splinecli info CAPTURE --mended-lights FILE`"
+WRITES_MENDED = "`splinecli info CAPTURE --mended-lights FILE`"
 
 
 def light_warnings(
     check: LightCheck, light_file: Path, frame: LightFrame, strict: bool
-) -> list[CaptureWarning]:
+) -> list[tuple[CaptureWarning, str]]:
     """Return the warnings about lights of a file that was read in a frame, which the advice
-    replaces.
+    replaces; each with its cause in a sentence if `check.mended` mends it, or "".
 
     If `strict`, also warn of properties that the images leave undetermined, which is the case for
     most reliefs without an outline. Each warning states the error of the normals.
     """
-    warnings = []
+    found = []
+
+    def add(kind: WarningKind, cause: str, advice: str) -> None:
+        warning = CaptureWarning(kind, f"{cause} {advice}", check.error_deg)
+        found.append((warning, "" if check.mended is None else cause))
+
     if check.order is not None:
         kind = codes.LIGHT_FRAME if check.order in (ZENITH, HALF_VECTORS) else codes.LIGHT_ORDER
-        warnings.append(CaptureWarning(kind, _order_text(check, light_file), check.error_deg))
+        add(kind, *_order_words(check, light_file))
     if check.best is not None:
         kind = codes.LIGHT_ORDER if check.best.is_order else codes.LIGHT_FRAME
-        warnings.append(
-            CaptureWarning(kind, _frame_text(check, check.best, frame, light_file), check.error_deg)
-        )
+        add(kind, *_frame_words(check, check.best, frame, light_file))
     if check.lacks_shadows:
         text = (
             f"Under the lights of {light_file.name}, the surface should cast shadows that are not"
@@ -365,41 +377,48 @@ def light_warnings(
         )
         # A bump looks the same as a hollow. With this error, about a quarter of the normals of a
         # good capture are expected within 5 degrees.
-        warnings.append(CaptureWarning(codes.LIGHTS_UNCHECKED, text, 10.0))
+        found.append((CaptureWarning(codes.LIGHTS_UNCHECKED, text, 10.0), ""))
     if strict and check.unchecked:
         text = (
             f"The lights of {light_file.name} could not be fully verified. Unchecked:"
             f" {'; '.join(check.unchecked)}."
         )
-        warnings.append(CaptureWarning(codes.LIGHTS_UNCHECKED, text))
-    return warnings
+        found.append((CaptureWarning(codes.LIGHTS_UNCHECKED, text), ""))
+    return found
 
 
-def _order_text(check: LightCheck, light_file: Path) -> str:
+def _order_words(check: LightCheck, light_file: Path) -> tuple[str, str]:
+    """Return in words why the order of the lights is wrong, and what to do."""
     given = 100 * check.given_misfit
     if check.order == UNKNOWN_ORDER:
-        return (
+        cause = (
             f"The images fit {light_file.name} no better than lights in a random order (misfit"
-            f" {given:.0f} % of a random order's). Its lines are in another order than the images,"
-            " or it belongs to another capture."
+            f" {given:.0f} % of a random order's)."
         )
-    remedy = "Check that its lines are in the order of the images."
+        advice = "Its lines are in another order than the images, or it belongs to another capture."
+        return cause, advice
+    advice = "Check that its lines are in the order of the images."
     if check.order == ZENITH:
-        remedy = "Replace each elevation by 90 degrees minus it."
+        advice = "Replace each elevation by 90 degrees minus it."
     elif check.order == HALF_VECTORS:
-        remedy = f"Double the angle of each light from the camera axis, as {_WRITES_MENDED} does."
+        advice = f"Double the angle of each light from the camera axis, as {WRITES_MENDED} does."
         if check.order_misfit > HALF_LEFT * check.given_misfit:  # a ring, recognised by the albedo
-            return (
+            cause = (
                 f"{light_file.name} probably contains half vectors, half-way between the lights"
-                f" and the camera axis: under them, steep slopes look brighter. {remedy}"
+                " and the camera axis: under them, steep slopes look brighter."
             )
-    return (
+            return cause, advice
+    cause = (
         f"The images fit the lights of {light_file.name} much better {check.order} (misfit"
-        f" {100 * check.order_misfit:.0f} % of a random order's, against {given:.0f} %). {remedy}"
+        f" {100 * check.order_misfit:.0f} % of a random order's, against {given:.0f} %)."
     )
+    return cause, advice
 
 
-def _frame_text(check: LightCheck, best: Candidate, frame: LightFrame, light_file: Path) -> str:
+def _frame_words(
+    check: LightCheck, best: Candidate, frame: LightFrame, light_file: Path
+) -> tuple[str, str]:
+    """Return in words why the frame of the lights is wrong, and what to do."""
     pairs = (
         ("curl", best.curl, check.given.curl, ".2f"),
         ("outline", best.rim, check.given.rim, "+.2f"),
@@ -415,25 +434,23 @@ def _frame_text(check: LightCheck, best: Candidate, frame: LightFrame, light_fil
         for each in (best, twin)
         if each is not None
     ]
-    text = f"The lights give normals that fit a surface much better {' or '.join(names)}"
-    if figures:
-        text += f" ({', '.join(figures)})"
+    cause = f"The lights give normals that fit a surface much better {' or '.join(names)}"
+    cause += f" ({', '.join(figures)})." if figures else "."
     if best.is_order:
-        return f"{text}. Check that the lines of {light_file.name} are in the order of the images."
+        return cause, f"Check that the lines of {light_file.name} are in the order of the images."
     which = (
         "They exchange bumps and hollows; without a closed outline, only the object itself shows"
         " which is right."
     )
     if best.frame is None:
-        return f"{text}. " + (
-            f"Rotate the light directions, as {_WRITES_MENDED} does." if twin is None else which
-        )
-    advice = f"{text}: run again with --light-frame {best.frame.after(frame)}"
+        rotates = f"Rotate the light directions, as {WRITES_MENDED} does."
+        return cause, rotates if twin is None else which
+    advice = f"Run again with --light-frame {best.frame.after(frame)}"
     if twin is not None and twin.frame is not None:
-        return f"{advice} or {twin.frame.after(frame)}. {which}"
+        return cause, f"{advice} or {twin.frame.after(frame)}. {which}"
     if best.frame.signs == (-1, -1, 1) and not best.frame.exchanged:
         advice += (
             ". If the object is hollow up to its outline, like the inside of a bowl, the lights"
             " are right"
         )
-    return f"{advice}."
+    return cause, f"{advice}."

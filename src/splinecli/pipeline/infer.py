@@ -164,9 +164,9 @@ def estimate_capture(
     distil: bool | None = None,
     progress: Callable[[int], object] | None = None,
     clock: Clock | None = None,
-) -> tuple[NormalEstimate, DistilledEstimator | None]:
-    """Return the normals of a prepared capture, with all warnings added to it, and the distilled
-    estimator if one was used.
+) -> tuple[NormalEstimate, DistilledEstimator | None, Work]:
+    """Return the normals of a prepared capture, with all warnings added to it, the distilled
+    estimator if one was used, and the work after its clear faults were mended.
 
     The capture is judged first, then `load` returns the estimator. `distil` is as in distil_for.
     `progress` is called with the number of pixels just estimated. If the options of the recipe are
@@ -175,8 +175,9 @@ def estimate_capture(
     """
     clock = clock or Clock()
     clock.begin("check", note="checking")
-    strict, prepared = work.options.strict, work.made.warnings
-    work = follow(work, "judgement", "judgement")
+    strict = work.options.strict
+    work = follow(work, "judgement", "mending")
+    prepared = work.made.warnings
     judged = work.judgement.warnings if work.judgement else ()
     refuse_if_strict([*prepared, *judged], work.made.name, strict=strict)
     capture = follow(work, "refinement", "refinement").made
@@ -200,7 +201,8 @@ def estimate_capture(
     if not any(warning.error_deg and warning.is_error for warning in warnings):
         warnings += check_confidence(estimate.expected_under_5)
     refuse_if_strict(warnings, capture.name, strict=strict)
-    return replace(estimate, capture=replace(estimate.capture, warnings=tuple(warnings))), distilled
+    estimate = replace(estimate, capture=replace(estimate.capture, warnings=tuple(warnings)))
+    return estimate, distilled, work
 
 
 def infer_capture(
@@ -242,9 +244,9 @@ def infer_capture(
             _check_light_files(target)
         load = load or cache(partial(make_method, options))
         work = _prepare(folder, options, clock)
+        _check_results(work.made, folder, options)
+        estimate, distilled, work = estimate_capture(work, load, distil=options.distil, clock=clock)
         source, capture = work.files, work.made
-        _check_results(capture, folder, options)
-        estimate, distilled = estimate_capture(work, load, distil=options.distil, clock=clock)
         for warning in estimate.capture.warnings:
             # usual in a batch, and of all its captures
             once = warning.code if warning.kind is EIGHT_BIT else None

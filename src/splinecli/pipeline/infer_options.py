@@ -387,6 +387,8 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
             finds_lights=self.finds_lights,
             first_light=self.first_light,
             strict=self.strict,
+            mends=not self.strict,
+            keeps_lights=self.light_frame is not None,
         )
 
     def open(self, folder: Path) -> CaptureSource:
@@ -564,6 +566,7 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
         return dataclasses.replace(
             super().recipe,
             as_stored=self.as_stored,
+            mends=not (self.as_stored or self.strict),
             auto_mask=self.auto_mask,
             refine_lights=self.refine_lights,
         )

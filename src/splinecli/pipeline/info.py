@@ -75,7 +75,7 @@ def describe_capture(
             "warning_codes": [warning.code for warning in warnings],
         }
         if mended_lights is not None:
-            mended = None if check is None or check.odd_image is not None else check.mended
+            mended = capture.light_directions if capture.mended else judgement.mended_lights
             if mended is not None:
                 write_bytes(
                     mended_lights, encode_lights(mended_lights, mended, source.files.images)

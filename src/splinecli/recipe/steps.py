@@ -19,20 +19,25 @@ from splinecli.capture.formats.images import common_size
 from splinecli.capture.linearise import StoredPixels
 from splinecli.capture.reader import CaptureOptions, open_capture
 from splinecli.capture.record import Capture, check_light_indices
-from splinecli.capture.source import Source
+from splinecli.capture.source import CaptureSource, Source
 from splinecli.errors import InputError
+from splinecli.images.alignment import MIN_IMAGES
 from splinecli.images.lamps import estimate_light_intensities, lamp_colours
 from splinecli.images.lens_blur import remove_blur, surroundings
 from splinecli.images.mask import find_object
 from splinecli.images.saturation import restore_saturated
 from splinecli.judge.checks import check_capture
+from splinecli.judge.explanations import SRGB_EXPONENT
 from splinecli.lights.light_fit import refine_capture
 from splinecli.maths import Float64Array
+from splinecli.maths.transfer import SRGB
 from splinecli.recipe.reading import Observed, exposure_warnings, read_observations
 from splinecli.recipe.registration import compare_colours, register
 from splinecli.recipe.work import USUAL, RecipeOptions, Work
 from splinecli.records.capture_warnings import (
+    CURVE_MENDED,
     ESTIMATED_INTENSITIES,
+    LIGHTS_MENDED,
     CaptureWarning,
     estimated_lights,
 )
@@ -196,6 +201,50 @@ def judge(work: Work, _: Callable[[], object]) -> Work:
     return replace(work, judgement=judgement)
 
 
+def mend(work: Work, _: Callable[[], object]) -> Work:
+    """Read the capture again as the faults that are clear demand; keep it as it is if the images
+    then contradict it in another way.
+    """
+    judgement, source, options = work.judgement, work.source, replace(work.options, mends=False)
+    assert judgement is not None and judgement.remedy is not None  # the step is wanted
+    remedy, notes = judgement.remedy, list[CaptureWarning]()
+    causes = " ".join(fault.cause for fault in remedy.faults)
+    if remedy.lights is not None:
+        if options.keeps_lights or source.has_positions or (remedy.lights[:, 2] <= 0).any():
+            return work
+        directions = source.light_directions.copy()
+        directions[list(work.indices)] = remedy.lights
+        source = replace(source, light_directions=directions)
+        text = f"{causes} They were corrected; --light-frame x-right,y-up keeps those of the file."
+        notes.append(CaptureWarning(LIGHTS_MENDED, text))
+    if remedy.curve is not None:
+        if not isinstance(source, CaptureSource) or not source.radiometry.automatic:
+            return work
+        curve = SRGB if remedy.curve == SRGB_EXPONENT else remedy.curve
+        radiometry = replace(source.radiometry, curve=curve, automatic=False)
+        source = replace(source, radiometry=radiometry)
+        text = f"{causes} They were decoded; --transfer linear reads them as they are."
+        notes.append(CaptureWarning(CURVE_MENDED, text))
+    if remedy.align:
+        if not isinstance(source, CaptureSource) or len(work.indices) < MIN_IMAGES:
+            return work
+        options = replace(options, align=True)
+    try:
+        mended = follow(begin(source, work.indices, options), last="judgement")
+    except InputError:  # images that cannot be aligned
+        return work
+    left = () if mended.judgement is None else mended.judgement.warnings
+    if any(warning.is_error for warning in left):
+        return work
+    capture = replace(
+        mended.made,
+        warnings=(*mended.made.warnings, *notes),
+        mended=tuple(fault.warning.code for fault in remedy.faults),
+    )
+    kept = judgement._replace(warnings=left)
+    return replace(mended, options=work.options, capture=capture, judgement=kept)
+
+
 def refine(work: Work, _: Callable[[], object]) -> Work:
     """Refine rough light directions; see refine_capture."""
     options, known = work.options, work.source.intensities_known
@@ -206,6 +255,11 @@ def refine(work: Work, _: Callable[[], object]) -> Work:
 def _compares_colours(work: Work) -> bool:
     """Whether the colours of the lamps may differ, and were not compared yet."""
     return work.source.lamps_may_differ and not (work.colours_known or work.options.as_stored)
+
+
+def _mends(work: Work) -> bool:
+    judged = work.judgement
+    return work.options.mends and judged is not None and judged.remedy is not None
 
 
 def _finds_mask(work: Work) -> bool:
@@ -253,6 +307,7 @@ STEPS = (
     Step("intensities", divide_by_intensities, lambda work: not work.options.as_stored),
     Step("saturation", restore, lambda work: not work.options.as_stored),
     Step("judgement", judge, lambda work: work.options.judges),
+    Step("mending", mend, _mends),
     Step("refinement", refine, lambda work: work.options.refine_lights),
 )
 _PLACES = {step.name: place for place, step in enumerate(STEPS)}

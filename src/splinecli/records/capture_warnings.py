@@ -74,6 +74,12 @@ CONSTANT_LIGHT = fault(
     " light](input-checks.md#other-interpretations-of-the-images) or a black level",
     "`--ambient IMAGE`, taken with all lamps off",
 )
+CURVE_MENDED = WarningKind(
+    "curve_mended",
+    "The images were clearly [encoded](input-checks.md#other-interpretations-of-the-images) without"
+    " stating it, and were decoded",
+    "`--transfer linear` if they are linear",
+)
 DARK_IMAGES = WarningKind(
     "dark_images", "The images use a small part of the range", "Use a longer exposure"
 )
@@ -91,6 +97,11 @@ EIGHT_BIT = WarningKind(
     "eight_bit",
     "The images have 8 bits",
     "Export 16-bit linear images, or use RAW; [round](robustness.md#8-bits), do not cut",
+)
+ELEVATION_SUSPECTED = fault(
+    "elevation_suspected",
+    "The images fit the lights much better if all of them are higher or lower",
+    "Correct the elevations in the light file, or use `info --mended-lights`",
 )
 ESTIMATED_COLOURS = WarningKind(
     "estimated_colours",
@@ -201,6 +212,12 @@ LIGHTS_MATCHED = WarningKind(
     "Lights were matched to images by a rule other than the full name",
     "Check the order of the lights",
 )
+LIGHTS_MENDED = WarningKind(
+    "lights_mended",
+    "The light directions clearly [contradicted the images](input-checks.md#wrong-light-directions)"
+    " and were corrected",
+    "`--light-frame x-right,y-up` uses the file as it is",
+)
 LIGHTS_NEAR_AXIS = WarningKind(
     "lights_near_axis", "All lights are close to the camera axis", "Add lower lights"
 )
@@ -209,6 +226,11 @@ LIGHTS_UNCHECKED = WarningKind(
     "Shadows that the lights should cast are missing; with `--strict`, also if the order or the"
     " frame of the lights [cannot be checked](input-checks.md#wrong-light-directions)",
     "Compare bumps and hollows with the object",
+)
+LIGHTS_TILTED = fault(
+    "lights_tilted",
+    "All lights are probably [tilted together](input-checks.md#wrong-light-directions)",
+    "Measure them in the frame of the camera, or use `info --mended-lights`",
 )
 LOW_CONFIDENCE = fault(
     "low_confidence",

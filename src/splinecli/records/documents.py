@@ -145,6 +145,7 @@ class EstimateReport(Document):
     # standard deviation in pixels of the blur that was removed from the images
     removed_blur: float | None
     alignment: AlignmentReport | None
+    mended: list[Code]  # faults that were clear and were mended
     material: MaterialFacts | None
     surface: SurfaceFacts | None
 

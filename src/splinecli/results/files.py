@@ -94,6 +94,7 @@ def report_of(
         white_level=capture.white_level,
         removed_blur=None if capture.removed_blur is None else round(capture.removed_blur, 2),
         alignment=None if alignment is None else convert(alignment, AlignmentReport),
+        mended=list(capture.mended),
         material=None,
         surface=None,
     ).as_dict()

@@ -1,0 +1,118 @@
+"""Lights that are all tilted together, found by the curl of the normals that they give.
+
+A rotation of all lights rotates all normals with them and changes no residual. But the normals of a
+surface have no curl (Horn, "Shape from shading", 1970), and rotated ones do, unless they were
+rotated about the view axis by 180 degrees. So the rotation with the least curl shows by how much
+lights are tilted, for example because they were measured in the frame of the table and the camera
+looks down at it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import binary_erosion, gaussian_filter
+from scipy.spatial.transform import Rotation
+
+from splinecli.lights.light_fit import Factors
+from splinecli.maths import Bools, Float64Array, Floats
+from splinecli.maths.normals import unit
+from splinecli.maths.robust import fit_robustly, shadow_weights
+
+_FITS = 5
+_MAX_PIXELS = 1500
+_SMOOTHING = 1.0  # standard deviation in pixels of the smoothing of the normals
+_LEAST_Z = 0.34  # slants beyond 70 degrees are left out
+_LEAST_SHARE = 0.6  # of the pixels that count as given, after a tilt
+_TILTS_DEG, _AZIMUTHS_DEG = (4.0, 8.0, 13.0, 19.0, 26.0, 34.0), np.arange(0.0, 360.0, 20.0)
+
+
+class Tilt(NamedTuple):
+    """The tilt of the lights under which the normals have the least curl."""
+
+    degrees: float  # by which the given lights are tilted
+    towards_deg: float  # the azimuth that they are tilted to, counter-clockwise from the right
+    curl: float  # of the normals that the given lights give: mean |curl| over mean derivative
+    left: float  # the share of it that is left after the lights are tilted back
+    matrix: Float64Array  # (3, 3) M, where lights @ M' are tilted back
+
+    def is_likely(self, factors: Factors | None, light_directions: Float64Array) -> bool:
+        """Return whether lights (F, 3) are probably tilted, as far as a matte surface explains the
+        images.
+        """
+        return self.degrees >= 8 and self.left <= 0.92
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the lights are tilted back without being asked."""
+        return self.degrees >= 8 and self.left <= 0.85
+
+
+def find_tilt(observations: Floats, mask: Bools, light_directions: Float64Array) -> Tilt | None:
+    """Return the tilt of lights (F, 3) that observations (P, F) at the pixels of a mask (H, W) show
+    best; None if too few pixels have neighbours.
+    """
+    values = observations.astype(np.float64)
+    values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
+    normals = np.zeros((*mask.shape, 3))
+    normals[mask] = unit(fit_robustly(values, shadow_weights(values), light_directions, _FITS)[0])
+    normals = unit(gaussian_filter(normals, (_SMOOTHING, _SMOOTHING, 0)))
+    inside = binary_erosion(mask)
+    if np.count_nonzero(inside) < 50 or min(mask.shape) < 2:
+        return None
+    downwards, right = np.gradient(normals, axis=(0, 1))
+    step = -(-np.count_nonzero(inside) // _MAX_PIXELS)
+    vectors = np.stack([each[inside][::step] for each in (normals, right, -downwards)])
+    tilts = [np.zeros((1, 2)), *(_around_axis(degrees, _AZIMUTHS_DEG) for degrees in _TILTS_DEG)]
+    tried = np.concatenate(tilts)
+    least = _LEAST_SHARE * float((vectors[0, :, 2] > _LEAST_Z).mean())
+    curls = _curls(vectors, tried, least)
+    for reach in (3.0, 1.0):  # search closer around the best one
+        offsets = reach * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), axis=-1).reshape(-1, 2)
+        near = tried[curls.argmin()] + offsets
+        tried = np.concatenate((tried, near))
+        curls = np.concatenate((curls, _curls(vectors, near, least)))
+    x, y = tried[curls.argmin()]
+    # The axis (x, y) is at a right angle to the azimuth of the tilt.
+    towards = float(np.degrees(np.arctan2(-x, y)) % 360)
+    left = float(curls.min() / max(curls[0], 1e-12))
+    matrix = _rotations(tried[[curls.argmin()]])[0].T
+    return Tilt(float(np.hypot(x, y)), towards, float(curls[0]), left, matrix)
+
+
+def _around_axis(degrees: float, azimuths_deg: Float64Array) -> Float64Array:
+    """Return the rotation vectors (n, 2) in degrees, in the image plane."""
+    azimuths = np.radians(azimuths_deg)
+    return degrees * np.stack((np.cos(azimuths), np.sin(azimuths)), axis=1)
+
+
+def _rotations(vectors_deg: Float64Array) -> Float64Array:
+    vectors = np.radians(np.pad(vectors_deg, ((0, 0), (0, 1))))
+    return np.asarray(Rotation.from_rotvec(vectors).as_matrix())
+
+
+def _curls(vectors: Float64Array, tilts: Float64Array, least: float) -> Float64Array:
+    """Return the curl (n,) of normals if their lights are tilted back by rotation vectors (n, 2).
+
+    `vectors` (3, p, 3) are normals and their derivatives to the right and upwards. A tilt after
+    which less than the least share of them faces the camera has infinite curl.
+    """
+    normals, right, up = np.einsum("dpi,kij->dkpj", vectors, _rotations(tilts))
+    z = normals[..., 2]
+    counts = z > _LEAST_Z
+    z = np.maximum(z, _LEAST_Z)
+
+    def slope(derivative: Float64Array, axis: int) -> Float64Array:
+        change = normals[..., axis] * derivative[..., 2] - derivative[..., axis] * z
+        return np.asarray(change / z**2)
+
+    p_x, p_y, q_x, q_y = slope(right, 0), slope(up, 0), slope(right, 1), slope(up, 1)
+    curl, size = np.abs(p_y - q_x), np.sqrt(p_x**2 + p_y**2 + q_x**2 + q_y**2)
+    # At edges of the object, both are huge.
+    largest = np.quantile(size, 0.95, axis=1, keepdims=True)
+    weights = counts * z**3
+    found = (weights * np.minimum(curl, largest)).sum(axis=1)
+    found /= np.maximum((weights * np.minimum(size, largest)).sum(axis=1), 1e-12)
+    # Pixels that turn away from the camera must not make a tilt look good.
+    return np.where(counts.mean(axis=1) >= least, found, np.inf)
