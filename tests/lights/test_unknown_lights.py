@@ -12,13 +12,8 @@ from splinecli import estimate_normals
 from splinecli.errors import InputError, UsageError
 from splinecli.estimate.confidence import add_common_error
 from splinecli.lights import unknown_lights
-from splinecli.lights.unknown_lights import (
-    bump_log_odds,
-    find_lights,
-    lower_lights,
-    outline_share,
-    turn_at_outline,
-)
+from splinecli.lights.outline import outline_share, turn_at_outline
+from splinecli.lights.unknown_lights import bump_log_odds, find_lights, lower_lights
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.records.capture_warnings import ESTIMATED_LIGHTS
 

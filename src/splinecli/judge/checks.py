@@ -15,7 +15,8 @@ from splinecli.capture.source import Source
 from splinecli.errors import InputError
 from splinecli.images.lamps import estimate_light_intensities
 from splinecli.judge.evidence import Evidence
-from splinecli.judge.explanations import LIKELY, SRGB_EXPONENT, Doubt, Explanation, Kind
+from splinecli.judge.explanations import CLEAR, LIKELY, SRGB_EXPONENT, Doubt, Explanation, Kind
+from splinecli.judge.judge_net import TILTED, TRANSLUCENT
 from splinecli.judge.light_check import WRITES_MENDED, LightCheck, light_warnings
 from splinecli.judge.odd_images import check_ground_truth
 from splinecli.lights.light_fit import would_refine
@@ -32,6 +33,7 @@ LEAST_EXPECTED = 0.1  # smallest expected share of normals within 5 degrees with
 # on flat objects they explain any order.
 DECISIVE = 0.35
 _MOST_NAMED = 4  # shifted images in a sentence
+_TRANSLUCENT_DEG = 8.0  # the usual median error of normals of translucent objects
 
 
 class Finding(NamedTuple):
@@ -188,8 +190,8 @@ def wrong_lights(seen: Evidence) -> Iterator[Finding]:
 
 def tilted_lights(seen: Evidence) -> Iterator[Finding]:
     """Warn of lights that are all tilted together."""
-    tilt = seen.tilt
-    if seen.has_positions or tilt is None or not tilt.is_likely(seen.factors, seen.directions):
+    tilt, probability = seen.tilt, seen.shares.get(TILTED, 0.0)
+    if seen.has_positions or tilt is None or probability < LIKELY:
         return
     mended = seen.directions @ tilt.matrix.T
     cause = (
@@ -203,7 +205,18 @@ def tilted_lights(seen: Evidence) -> Iterator[Finding]:
     )
     error_deg = median_turn_deg(seen.observations, seen.directions, mended)
     warning = CaptureWarning(codes.LIGHTS_TILTED, text, error_deg)
-    yield Finding(warning, seen.under_lights(mended), tilt.is_clear, cause)
+    yield Finding(warning, seen.under_lights(mended), probability > CLEAR, cause)
+
+
+def strange_material(seen: Evidence) -> Iterator[Finding]:
+    """Warn of a material that no method knows."""
+    if seen.shares.get(TRANSLUCENT, 0.0) < LIKELY:
+        return
+    text = (
+        "The object looks translucent, like wax, marble or skin: light that enters it softens the"
+        " shading, which flattens the normals by several degrees with every method."
+    )
+    yield Finding(CaptureWarning(codes.UNKNOWN_MATERIAL, text, _TRANSLUCENT_DEG))
 
 
 def rough_lights(seen: Evidence) -> Iterator[Finding]:
@@ -393,6 +406,7 @@ CHECKS = [
     Check(crowded_lights),
     Check(other_readings),
     Check(tilted_lights),
+    Check(strange_material),
     Check(wrong_truth),
     Check(rough_lights),
 ]

@@ -23,6 +23,7 @@ from splinecli.judge.explanations import (
     Kind,
     constant_light,
 )
+from splinecli.judge.judge_net import CLASSES, features_of, judge_net
 from splinecli.judge.light_check import LightCheck, check_lights
 from splinecli.judge.odd_images import ImageShift, find_shifts
 from splinecli.judge.shading_shifts import moved_back, shading_shifts
@@ -32,6 +33,8 @@ from splinecli.lights.rough_normals import median_turn_deg
 from splinecli.maths import Float64Array, Floats
 from splinecli.maths.normals import unit
 from splinecli.maths.robust import solve_each
+
+_COARSE_PIXELS = 3000
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,26 +152,57 @@ class Evidence:
             self.observations if self.intensities is None else self.observations * self.intensities
         )
         sample = replace(self.sample, observations=observations)
-        return Explanations(sample, self.directions, self.intensities, eight_bit=self.eight_bit)
+        return Explanations(sample, self.directions, self.intensities)
+
+    @cached_property
+    def coarse(self) -> Evidence:
+        """The evidence of fewer pixels, for measures that are taken after each reading."""
+        step = int(np.ceil(np.sqrt(len(self.sample.observations) / _COARSE_PIXELS)))
+        if step < 2:
+            return self
+        part = np.zeros_like(self.sample.mask)
+        part[::step, ::step] = self.sample.mask[::step, ::step]
+        sample = Sample(
+            self.observations[part[self.sample.mask]],
+            self.sample.mask[::step, ::step],
+            self.sample.step * step,
+        )
+        return replace(self, sample=sample, lamps=None)
+
+    @cached_property
+    def shares(self) -> dict[str, float]:
+        """The probability of each class of judge_net.py; empty if the capture cannot be judged."""
+        features = features_of(self)
+        if features is None:
+            return {}
+        return dict(zip(CLASSES, judge_net().probabilities(features).tolist(), strict=True))
 
     @cached_property
     def doubt(self) -> Doubt | None:
-        """The other reading that fits the images best, and its probability; None if the readings
+        """The other reading that is most probably right, and its probability; None if the readings
         cannot be compared.
         """
-        kinds: set[Kind] = {"offset", "intensities", "elevation"}
-        if self.linear:
-            kinds.add("curve")
-        if not self.has_positions:
-            kinds.add("near")
-        # Estimated intensities are divided out.
-        divided: set[Kind] = set() if self.estimated is None else {"intensities"}
-        return self.explanations.likeliest(kinds - self.accepted, accepted=self.accepted | divided)
+        shares, readings = self.shares, self.explanations.readings
+        kinds = set(readings) - self.accepted
+        if not self.linear:
+            kinds -= {"curve"}
+        if self.has_positions:
+            kinds -= {"near"}
+        if self.estimated is not None:  # they are divided out
+            kinds -= {"intensities"}
+        if not kinds:
+            return None
+        best, *others = sorted(kinds, key=lambda kind: -shares[kind])
+        total = float(sum(shares[kind] for kind in kinds))
+        # Explanations that are this likely, compared with the likeliest one, are named beside it.
+        likely = tuple(kind for kind in others if shares[kind] > 0.3 * shares[best])
+        return Doubt(readings[best], total, likely)
 
     @cached_property
     def tilt(self) -> Tilt | None:
         """The tilt of the lights that the curl of the normals shows."""
-        return find_tilt(self.evened.observations, self.evened.mask, self.directions)
+        sample = self.coarse.evened
+        return find_tilt(sample.observations, sample.mask, self.directions)
 
     @cached_property
     def light_check(self) -> LightCheck:

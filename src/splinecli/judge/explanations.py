@@ -1,19 +1,14 @@
 """Other readings of the images and their lights: encoded values, near lamps, unequal intensities,
 light that every image has, and elevations of the lights that are all too high or too low.
 
-Any one of them can be mistaken for another, so all are fitted to the same pixels and compared
-together. A matte model is fitted under each reading, and its residual is computed in stored values.
-The probability of a reading is
-
-    p proportional to exp(-c) (residual of the reading / residual of the given reading)^-k
-
-where the cost c penalises a reading for its additional freedom and for being rare, and k is the
-weight of the residuals, since no real material is matte. Both were fitted to captures of all
-classes of materials with and without these faults (benchmarks/capture_faults.py --fit).
+Any one of them can be mistaken for another, so all are fitted to the same pixels. A matte model is
+fitted under each reading, and its residual is computed in stored values. judge_net.py compares them
+together.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Literal, NamedTuple, get_args
 
@@ -22,7 +17,7 @@ import numpy as np
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.sample import Sample
 from splinecli.maths import Float64Array, Floats
-from splinecli.maths.normals import angle_between_deg, spread_of, unit
+from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.robust import absolute_weights, inverse_3x3, lit_values, multiply_symmetric
 
 Kind = Literal["curve", "near", "offset", "intensities", "elevation"]
@@ -45,29 +40,11 @@ _HEIGHTS = (
     2.5,
 )  # factors of z of the lights
 _WIDTHS = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 11.0)  # distances of lamps, in widths of the object
-COSTS: dict[Kind, float] = {
-    "curve": 2.35,
-    "near": 2.6,
-    "offset": 3.35,
-    "intensities": 2.75,
-    "elevation": 3.0,
-}
-POWERS: dict[Kind, float] = {
-    "curve": 6.2,
-    "near": 8.1,
-    "offset": 5.7,
-    "intensities": 2.8,
-    "elevation": 6.0,
-}
 LIKELY = 0.5  # probability from which a reading is named
 CLEAR = 0.95  # probability from which images are read so
-_LEAST_LIGHTS: dict[Kind, int] = {
-    "curve": 6,
-    "near": 6,
-    "offset": 4,
-    "intensities": 6,
-    "elevation": 6,
-}
+_FOR_MOST = 6  # fewer lights determine the constant light only
+# share of the residual at which a curve behind unequal lamps is better than one behind equal ones
+_MUCH_LESS = 0.6
 _ROWS, _COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]  # xx, yy, zz, xy, xz, yz of a product
 _SHADOW = 0.1  # of a pixel's largest value; smaller values are shadow
 
@@ -81,7 +58,6 @@ class Explanation:
     # for intensities
     amount: float
     ratio: float  # residual over the given reading's, on the same observations
-    evidence: float  # logarithm of its probability over the given reading's
     normals: Float64Array  # (p, 3), scaled, at the chosen pixels
     intensities: Float64Array  # (F,), mean 1; ones unless they are free
 
@@ -91,7 +67,8 @@ class Doubt(NamedTuple):
 
     reading: Explanation
     probability: float  # that any other reading is right
-    others: tuple[Kind, ...]  # kinds of readings that the images hardly distinguish from it
+    # kinds of readings that the images hardly distinguish from it
+    others: tuple[Kind, ...] = ()
 
     @property
     def is_clear(self) -> bool:
@@ -100,7 +77,9 @@ class Doubt(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class Fit:
+    """A matte model under one reading."""
+
     residual: float
     normals: Float64Array
     intensities: Float64Array
@@ -111,7 +90,6 @@ class Explanations:
     to them.
 
     `lights` are (F, 3), unit; `intensities` (F,) were measured, or are None for equal ones.
-    `eight_bit` is whether the images have 8 bits and do not state that they are linear.
     """
 
     def __init__(
@@ -119,8 +97,6 @@ class Explanations:
         sample: Sample,
         lights: Float64Array,
         intensities: Float64Array | None = None,
-        *,
-        eight_bit: bool = False,
     ) -> None:
         n_lights = len(lights)
         # Pixels below this share of the brightest hundredth are background.
@@ -136,75 +112,38 @@ class Explanations:
         self.values, self.lights, self.intensities = values[enough], lights, intensities
         self.rows, self.columns = (places[chosen[enough]] for places in np.nonzero(sample.mask))
         self.width = float(np.ptp(np.flatnonzero(sample.mask.any(axis=0))) + 1)
-        self.shape, self.eight_bit = sample.mask.shape, eight_bit
+        self.shape = sample.mask.shape
         self.are_enough = n_lights >= 4 and len(self.values) >= 60
 
-    def fit(self, kinds: Collection[Kind]) -> list[Explanation]:
-        """Return the best reading of each of these kinds; none of too few lit pixels or lights."""
+    @cached_property
+    def given(self) -> Fit:
+        """The fit under the given reading."""
+        return _fit(self.values, self._with(self.lights))[0]
+
+    @cached_property
+    def readings(self) -> dict[Kind, Explanation]:
+        """The best reading of each kind; none with too few lit pixels or lights."""
         if not self.are_enough:
-            return []
-        kinds = [
-            kind for kind in ALL_KINDS if kind in kinds and len(self.lights) >= _LEAST_LIGHTS[kind]
-        ]
-        vectors = self._with(self.lights)
-        (given,), found = _fit(self.values, vectors), list[Explanation]()
-        if "offset" in kinds:
-            found.append(_best("offset", self._offset_fits(vectors), given))
-        if "curve" in kinds:
-            found.append(self._best_curve())
-        if not {"near", "intensities"}.isdisjoint(kinds):
-            (free,) = _fit(self.values, vectors, free=True)
-        if "near" in kinds:
-            found.append(self._best_near(free))
-        if "elevation" in kinds:
-            lights = [self._with(unit(self.lights * (1, 1, height))) for height in _HEIGHTS]
-            fits = dict(zip(_HEIGHTS, _fit(self.values, np.stack(lights)[:, None]), strict=True))
-            found.append(_best("elevation", fits, given))
-        if "intensities" in kinds:
-            unequal = _best("intensities", {1.0: free}, given, _cost_of_equal(free.intensities))
-            found.append(unequal)
-            if "curve" in kinds:  # unequal lamps may hide a curve
-                curve = self._best_curve(free=True)
-                # The intensities under the curve matter, not the intensities that a linear reading
-                # needs.
-                of_lamps = (
-                    unequal.evidence
-                    + _cost_of_equal(free.intensities)
-                    - _cost_of_equal(curve.intensities)
-                )
-                evidence = curve.evidence + of_lamps
-                found.append(replace(curve, ratio=curve.ratio * unequal.ratio, evidence=evidence))
-        return found
-
-    def likeliest(
-        self, kinds: Collection[Kind], *, accepted: Collection[Kind] = ()
-    ) -> Doubt | None:
-        """Return the reading of these kinds that fits best, and how likely it is; None if they
-        cannot be compared.
-
-        Kinds that are `accepted` are part of the given reading.
-        """
-        found = self.fit(kinds)
-        if not found:
-            return None
-        evidence = np.array([reading.evidence for reading in found])
-        probabilities = np.exp(evidence - np.logaddexp.reduce([0.0, *evidence]))
-        shares = dict.fromkeys(
-            (reading.kind for reading in found if reading.kind not in accepted), 0.0
-        )
-        for reading, probability in zip(found, probabilities, strict=True):
-            if reading.kind in shares:
-                shares[reading.kind] += float(probability)
-        ranked = sorted(shares, key=lambda kind: -shares[kind])
-        if not ranked:
-            return None
-        best = max(
-            (reading for reading in found if reading.kind == ranked[0]),
-            key=lambda reading: reading.evidence,
-        )
-        # Explanations that are this likely, compared with the likeliest one, are named beside it.
-        others = [kind for kind in ranked[1:] if shares[kind] > 0.3 * shares[ranked[0]]]
-        return Doubt(best, sum(shares.values()), tuple(others))
+            return {}
+        vectors, given = self._with(self.lights), self.given
+        found: dict[Kind, Explanation] = {
+            "offset": _best("offset", self._offset_fits(vectors), given)
+        }
+        if len(self.lights) < _FOR_MOST:
+            return found
+        (free,) = _fit(self.values, vectors, free=True)
+        unequal = _best("intensities", {1.0: free}, given)
+        curve, behind = self._best_curve(), self._best_curve(free=True)
+        # unequal lamps may hide a curve
+        behind = replace(behind, ratio=behind.ratio * unequal.ratio)
+        lights = np.stack([self._with(unit(self.lights * (1, 1, each))) for each in _HEIGHTS])
+        heights = dict(zip(_HEIGHTS, _fit(self.values, lights[:, None]), strict=True))
+        return found | {
+            "curve": behind if behind.ratio < _MUCH_LESS * curve.ratio else curve,
+            "near": self._best_near(free),
+            "intensities": unequal,
+            "elevation": _best("elevation", heights, given),
+        }
 
     def error_deg(self, reading: Explanation, used: Float64Array | None = None) -> float:
         """Return the median angle in degrees between a reading's normals and the given reading's.
@@ -212,42 +151,38 @@ class Explanations:
         `used` are the intensities (F,) that were estimated and are divided out; None for none.
         """
         lights = self.lights if used is None else self.lights * used[:, None]
-        (given,) = _fit(self.values, self._with(lights))
+        given = self.given if used is None else _fit(self.values, self._with(lights))[0]
         return float(np.median(angle_between_deg(unit(given.normals), unit(reading.normals))))
 
     def _best_curve(self, *, free: bool = False) -> Explanation:
         # encoded shadows are brighter
         vectors, gammas = self._with(self.lights), (1.0, *_EXPONENTS)
         given, *fits = _fit(self.values, vectors, gammas, free=free, shadow=0.35)
-        return _best(
-            "curve",
-            dict(zip(_EXPONENTS, fits, strict=True)),
-            given,
-            -0.8 if self.eight_bit else 0.0,
-        )
+        return _best("curve", dict(zip(_EXPONENTS, fits, strict=True)), given)
 
-    def _best_near(self, given: _Fit) -> Explanation:
+    def _best_near(self, given: Fit) -> Explanation:
         """Return the best distance. Intensities are free: near lamps look unequal, and unequal
         lamps may be near.
         """
         lights = np.stack([self._with(self._near(widths)) for widths in _WIDTHS])
         fits = dict(zip(_WIDTHS, _fit(self.values, lights, free=True), strict=True))
-        best = _best("near", fits, given)
+        return _best("near", fits, given)
+
+    @cached_property
+    def roundness(self) -> float:
+        """How round the object is: the share of the variance of the pixels' places that a cubic
+        function of the slopes of the normals predicts.
+
+        On a ball, gloss varies with the position, like the light of near lamps.
+        """
         places = np.stack((self.columns, -self.rows), axis=1)
-        # On a ball, gloss varies with the position, like the light of near lamps. It is round if a
-        # cubic function of the slopes of its normals predicts this share of the variance of the
-        # places; near lamps then cost more.
-        across = unit(best.normals)[:, :2]
+        across = unit(self.given.normals)[:, :2]
         cubic = across * (across**2).sum(axis=1, keepdims=True)
         terms = np.concatenate((across, cubic, np.ones((len(across), 1))), axis=1)
         missed = places - terms @ np.linalg.lstsq(terms, places, rcond=None)[0]
-        roundness = float(1 - missed.var(axis=0).sum() / max(places.var(axis=0).sum(), 1e-12))
-        cost = 1.9 if roundness > 0.85 else 0.0
-        # At an end of the distances, the residual may fall beyond.
-        cost += 1.3 if best.amount in (_WIDTHS[0], _WIDTHS[-1]) else 0.0
-        return replace(best, evidence=best.evidence - cost)
+        return float(1 - missed.var(axis=0).sum() / max(places.var(axis=0).sum(), 1e-12))
 
-    def _offset_fits(self, vectors: Float64Array) -> dict[float, _Fit]:
+    def _offset_fits(self, vectors: Float64Array) -> dict[float, Fit]:
         """Return fits with constant light, over the value of a pixel that faces the light, and
         around the best one.
         """
@@ -269,32 +204,13 @@ class Explanations:
         return lights if self.intensities is None else lights * self.intensities[:, None]
 
 
-def _best(kind: Kind, fits: Mapping[float, _Fit], given: _Fit, cost: float = 0.0) -> Explanation:
-    """Return the best of some fits by their amounts, with this cost added to the cost of its kind.
-
-    The pixels of a flat object repeat each other, so that a reading may fit them by chance.
-    """
+def _best(kind: Kind, fits: Mapping[float, Fit], given: Fit) -> Explanation:
+    """Return the best of some fits by their amounts."""
     amount = min(fits, key=lambda each: fits[each].residual)
     found = fits[amount]
     least = 1e-4  # 16 bits do not go below it
     ratio = (found.residual + least) / (given.residual + least)
-    power = POWERS[kind]
-    if len(given.intensities) < _LEAST_LIGHTS["curve"]:
-        power *= 0.6  # four or five lights
-    # Lamps that differ by 20 % leave so much on a flat object; gloss leaves less.
-    if kind != "intensities" or given.residual < 0.06:
-        spread = max(spread_of(unit(fit.normals)) for fit in (given, found))
-        # Spread of the normals (their second largest standard deviation) from which powers have
-        # full weight, and the share of the weight for a plate.
-        power *= float(np.clip(spread / 0.3, 0.45, 1))
-    evidence = -COSTS[kind] - cost - power * np.log(ratio)
-    return Explanation(kind, amount, ratio, float(evidence), found.normals, found.intensities)
-
-
-def _cost_of_equal(intensities: Float64Array) -> float:
-    # Intensities that are nearly equal are more likely a curve or a material: up to this cost is
-    # added for them, by the standard deviation of their logarithms.
-    return float(10.0 * np.exp(-((np.std(np.log(intensities)) / 0.15) ** 2)))
+    return Explanation(kind, amount, ratio, found.normals, found.intensities)
 
 
 def _fit(
@@ -304,7 +220,7 @@ def _fit(
     *,
     free: bool = False,
     shadow: float = _SHADOW,
-) -> list[_Fit]:
+) -> list[Fit]:
     """Fit values^gamma = e max(l . b, 0) by least absolute deviations of the values, side by side
     for each gamma and each set of lights.
 
@@ -333,7 +249,7 @@ def _fit(
 
 def _fit_with_offsets(
     values: Float64Array, lights: Float64Array, offsets: Sequence[float]
-) -> dict[float, _Fit]:
+) -> dict[float, Fit]:
     """Fit values = max(l . b, 0) + offset |b|, as in _fit, for lights (F, 3) and each offset."""
     stored, vectors = values.T, _by_axis(lights)
     products, offset = _products(vectors), np.array(offsets)[:, None, None]
@@ -375,13 +291,13 @@ def constant_light(values: Floats, lights: Float64Array, share: float) -> Float6
 
 def _described(
     residuals: Float64Array, normals: Float64Array, intensities: Float64Array
-) -> list[_Fit]:
+) -> list[Fit]:
     """Return fits from their residuals (H, n), normals (H, 3, p) and intensities (H, F)."""
     mean = residuals.mean(axis=1)
     # The fits to few lights pass through most values. The median would be zero.
     typical = np.median(residuals, axis=1) if intensities.shape[1] >= 8 else mean
     sizes = np.sqrt(mean * typical).tolist()
-    return [_Fit(*each) for each in zip(sizes, normals.swapaxes(1, 2), intensities, strict=True)]
+    return [Fit(*each) for each in zip(sizes, normals.swapaxes(1, 2), intensities, strict=True)]
 
 
 def _by_axis(lights: Float64Array) -> Float64Array:

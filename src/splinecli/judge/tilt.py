@@ -15,7 +15,6 @@ import numpy as np
 from scipy.ndimage import binary_erosion, gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from splinecli.lights.light_fit import Factors
 from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.maths.normals import unit
 from splinecli.maths.robust import fit_robustly, shadow_weights
@@ -35,50 +34,61 @@ class Tilt(NamedTuple):
     towards_deg: float  # the azimuth that they are tilted to, counter-clockwise from the right
     curl: float  # of the normals that the given lights give: mean |curl| over mean derivative
     left: float  # the share of it that is left after the lights are tilted back
+    # the fall over its standard error, if one in nine pixels is independent of its neighbours
+    significance: float
     matrix: Float64Array  # (3, 3) M, where lights @ M' are tilted back
-
-    def is_likely(self, factors: Factors | None, light_directions: Float64Array) -> bool:
-        """Return whether lights (F, 3) are probably tilted, as far as a matte surface explains the
-        images.
-        """
-        return self.degrees >= 8 and self.left <= 0.92
-
-    @property
-    def is_clear(self) -> bool:
-        """Whether the lights are tilted back without being asked."""
-        return self.degrees >= 8 and self.left <= 0.85
 
 
 def find_tilt(observations: Floats, mask: Bools, light_directions: Float64Array) -> Tilt | None:
     """Return the tilt of lights (F, 3) that observations (P, F) at the pixels of a mask (H, W) show
     best; None if too few pixels have neighbours.
     """
+    vectors = _derivatives(observations, mask, light_directions)
+    if vectors is None:
+        return None
+    tilts = [np.zeros((1, 2)), *(_around_axis(degrees, _AZIMUTHS_DEG) for degrees in _TILTS_DEG)]
+    tried = np.concatenate(tilts)
+    least = _LEAST_SHARE * float((vectors[0, :, 2] > _LEAST_Z).mean())
+    terms = _curls(vectors, tried, least)
+    for reach in (3.0, 1.0):  # search closer around the best one
+        offsets = reach * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), axis=-1).reshape(-1, 2)
+        near = tried[terms.sum(axis=1).argmin()] + offsets
+        tried = np.concatenate((tried, near))
+        terms = np.concatenate((terms, _curls(vectors, near, least)))
+    curls = terms.sum(axis=1)
+    x, y = tried[curls.argmin()]
+    fall = terms[0] - terms[curls.argmin()]
+    significance = float(fall.sum() / max(3 * np.sqrt(len(fall)) * fall.std(), 1e-12))
+    # The axis (x, y) is at a right angle to the azimuth of the tilt.
+    towards = float(np.degrees(np.arctan2(-x, y)) % 360)
+    left = float(curls.min() / max(curls[0], 1e-12))
+    matrix = _rotations(tried[[curls.argmin()]])[0].T
+    return Tilt(float(np.hypot(x, y)), towards, float(curls[0]), left, significance, matrix)
+
+
+def curl_of(observations: Floats, mask: Bools, light_directions: Float64Array) -> float:
+    """Return the curl of the normals that lights (F, 3) give, NaN for too few pixels; see Tilt."""
+    vectors = _derivatives(observations, mask, light_directions)
+    return float("nan") if vectors is None else float(_curls(vectors, np.zeros((1, 2)), 0.0).sum())
+
+
+def _derivatives(
+    observations: Floats, mask: Bools, light_directions: Float64Array
+) -> Float64Array | None:
+    """Return normals and their derivatives to the right and upwards (3, p, 3), at some pixels with
+    neighbours; None for too few.
+    """
+    inside = binary_erosion(mask)
+    if np.count_nonzero(inside) < 50 or min(mask.shape) < 2:
+        return None
     values = observations.astype(np.float64)
     values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
     normals = np.zeros((*mask.shape, 3))
     normals[mask] = unit(fit_robustly(values, shadow_weights(values), light_directions, _FITS)[0])
     normals = unit(gaussian_filter(normals, (_SMOOTHING, _SMOOTHING, 0)))
-    inside = binary_erosion(mask)
-    if np.count_nonzero(inside) < 50 or min(mask.shape) < 2:
-        return None
     downwards, right = np.gradient(normals, axis=(0, 1))
     step = -(-np.count_nonzero(inside) // _MAX_PIXELS)
-    vectors = np.stack([each[inside][::step] for each in (normals, right, -downwards)])
-    tilts = [np.zeros((1, 2)), *(_around_axis(degrees, _AZIMUTHS_DEG) for degrees in _TILTS_DEG)]
-    tried = np.concatenate(tilts)
-    least = _LEAST_SHARE * float((vectors[0, :, 2] > _LEAST_Z).mean())
-    curls = _curls(vectors, tried, least)
-    for reach in (3.0, 1.0):  # search closer around the best one
-        offsets = reach * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), axis=-1).reshape(-1, 2)
-        near = tried[curls.argmin()] + offsets
-        tried = np.concatenate((tried, near))
-        curls = np.concatenate((curls, _curls(vectors, near, least)))
-    x, y = tried[curls.argmin()]
-    # The axis (x, y) is at a right angle to the azimuth of the tilt.
-    towards = float(np.degrees(np.arctan2(-x, y)) % 360)
-    left = float(curls.min() / max(curls[0], 1e-12))
-    matrix = _rotations(tried[[curls.argmin()]])[0].T
-    return Tilt(float(np.hypot(x, y)), towards, float(curls[0]), left, matrix)
+    return np.stack([each[inside][::step] for each in (normals, right, -downwards)])
 
 
 def _around_axis(degrees: float, azimuths_deg: Float64Array) -> Float64Array:
@@ -93,7 +103,8 @@ def _rotations(vectors_deg: Float64Array) -> Float64Array:
 
 
 def _curls(vectors: Float64Array, tilts: Float64Array, least: float) -> Float64Array:
-    """Return the curl (n,) of normals if their lights are tilted back by rotation vectors (n, 2).
+    """Return the terms (n, p) whose sums are the curl of normals if their lights are tilted back by
+    rotation vectors (n, 2).
 
     `vectors` (3, p, 3) are normals and their derivatives to the right and upwards. A tilt after
     which less than the least share of them faces the camera has infinite curl.
@@ -112,7 +123,7 @@ def _curls(vectors: Float64Array, tilts: Float64Array, least: float) -> Float64A
     # At edges of the object, both are huge.
     largest = np.quantile(size, 0.95, axis=1, keepdims=True)
     weights = counts * z**3
-    found = (weights * np.minimum(curl, largest)).sum(axis=1)
-    found /= np.maximum((weights * np.minimum(size, largest)).sum(axis=1), 1e-12)
+    found = weights * np.minimum(curl, largest)
+    found /= np.maximum((weights * np.minimum(size, largest)).sum(axis=1, keepdims=True), 1e-12)
     # Pixels that turn away from the camera must not make a tilt look good.
-    return np.where(counts.mean(axis=1) >= least, found, np.inf)
+    return np.where(counts.mean(axis=1, keepdims=True) >= least, found, np.inf)

@@ -20,7 +20,6 @@ ambiguities.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -35,7 +34,8 @@ from splinecli.lights.light_net import (
     network_inputs,
     square_images,
 )
-from splinecli.lights.rough_normals import cast_shadows, outward_directions, smooth_normals
+from splinecli.lights.outline import DARK_SHARE, outline_share, turn_at_outline
+from splinecli.lights.rough_normals import cast_shadows, smooth_normals
 from splinecli.maths import Bools, Float32Array, Float64Array
 from splinecli.maths.normals import unit
 from splinecli.maths.pixel_grid import Blocks
@@ -45,7 +45,6 @@ from splinecli.system.machine import side_by_side
 
 _FITS = 5
 _LEAST_Z = 0.1  # of normals that are integrated
-_DARK_SHARE = 0.02  # of the brightest hundredth
 # logarithms of the factors of the heights of the lights that are tried
 _LOG_HEIGHTS = np.arange(-1.2, 0.05, 0.1)
 _ALBEDO_BINS = 41  # of 0.1, of the logarithm of the albedo
@@ -60,7 +59,7 @@ def bump_log_odds(observations: Float32Array, mask: Bools, light_directions: Flo
     blocks = Blocks.over(mask, 1200)
     values, mask = blocks.average(observations, mask).astype(np.float64), blocks.mask
     brightest = values.max(axis=1, keepdims=True)
-    bright = brightest > _DARK_SHARE * np.quantile(brightest, 0.99)
+    bright = brightest > DARK_SHARE * np.quantile(brightest, 0.99)
     values /= np.maximum(brightest, 1e-12)
     scaled, _ = fit_robustly(values, shadow_weights(values), light_directions, _FITS)
     rough = smooth_normals(scaled, mask)
@@ -107,7 +106,7 @@ def lower_lights(
     # The network finds lower lights too high.
     if np.degrees(np.arcsin(light_directions[:, 2].clip(-1, 1))).mean() > 55.0:
         return light_directions
-    chosen, values = lit_values(observations, _DARK_SHARE, 2000)
+    chosen, values = lit_values(observations, DARK_SHARE, 2000)
     lit = values > 0.1 * np.quantile(values, 0.6, axis=1, keepdims=True)
     scaled, _ = fit_robustly(values, lit.astype(np.float64), light_directions, _FITS)
     known = (lit.sum(axis=1) > 3) & (unit(scaled)[:, 2] > _LEAST_Z)
@@ -129,99 +128,6 @@ def _entropy(scaled_normals: Float64Array) -> float:
     counts = np.bincount(places.clip(0, _ALBEDO_BINS - 1).astype(int), minlength=_ALBEDO_BINS)
     shares = np.convolve(counts / len(albedo), (0.25, 0.5, 0.25))
     return float(-(shares[shares > 0] * np.log(shares[shares > 0])).sum())
-
-
-class OutlineTurn(NamedTuple):
-    """A rotation that turns the normals at the outline outwards."""
-
-    rotation: Float64Array  # (3,), the rotation vector of lights and normals
-    # median absolute residual in z of these normals; small if a smooth surface forms the outline
-    spread: float
-
-    @property
-    def angle_deg(self) -> float:
-        """The angle of the rotation."""
-        return float(np.degrees(np.linalg.norm(self.rotation)))
-
-    def share(self, part: float) -> Float64Array:
-        """Return a part of the rotation (3, 3), from 0 to 1."""
-        from scipy.spatial.transform import Rotation
-
-        return np.asarray(Rotation.from_rotvec(part * self.rotation).as_matrix())
-
-
-def turn_at_outline(
-    observations: Float32Array, mask: Bools, light_directions: Float64Array
-) -> OutlineTurn | None:
-    """Return the rotation of the lights that the outline shows, or None. The border of the image is
-    ignored.
-
-    See bump_log_odds for the arguments.
-    """
-    from scipy.spatial.transform import Rotation
-
-    normals, outwards = _rim(observations, mask, light_directions)
-    if len(normals) < 20:  # fewer lit pixels at the outline show no rotation
-        return None
-    along = np.cross((0.0, 0.0, 1.0), outwards)
-    turn = Rotation.identity()
-    for _ in range(25):
-        turned = turn.apply(normals)
-        # A small rotation w adds w x n. The first residual is along the view axis, the second along
-        # the outline. Normals within a pixel of the outline have a z of about 0.25, because pixels
-        # have a size and masks end inside.
-        residuals = np.stack((turned[:, 2] - 0.25, (turned * along).sum(axis=1)))
-        slopes = np.stack((np.cross(turned, (0.0, 0.0, 1.0)), np.cross(turned, along)))
-        weights = 1 / (np.abs(residuals) + 0.1)
-        curvature = np.einsum("kp,kpi,kpj->ij", weights, slopes, slopes) + 1e-3 * np.eye(3)
-        step = np.linalg.solve(curvature, -np.einsum("kp,kpi,kp->i", weights, slopes, residuals))
-        turn = Rotation.from_rotvec(step) * turn
-        if np.abs(step).max() < 1e-4:
-            break
-    return OutlineTurn(np.asarray(turn.as_rotvec()), float(np.median(np.abs(residuals[0]))))
-
-
-def outline_share(mask: Bools) -> float:
-    """Return the share of the outer boundary of a mask (H, W) that is not at or near the border of
-    the image.
-    """
-    boundary = _boundary(mask)
-    # Masks of objects that fill the image may leave out a border of this share of its sides
-    rows, columns = (1 + round(0.01 * side) for side in mask.shape)
-    inside = boundary[rows:-rows, columns:-columns]
-    return int(np.count_nonzero(inside)) / max(int(np.count_nonzero(boundary)), 1)
-
-
-def _boundary(mask: Bools) -> Bools:
-    """Return the pixels of a mask (H, W) at its outer boundary; holes have none."""
-    from scipy.ndimage import binary_erosion, binary_fill_holes
-
-    filled = binary_fill_holes(mask)
-    return np.asarray(mask & ~binary_erosion(filled, np.ones((3, 3))))
-
-
-def _rim(
-    observations: Float32Array, mask: Bools, light_directions: Float64Array
-) -> tuple[Float64Array, Float64Array]:
-    """Return the normals (p, 3) of lit pixels at the outline, and the directions (p, 3) outwards,
-    with z = 0.
-    """
-    rim = _boundary(mask)
-    rim[[0, -1]] = rim[:, [0, -1]] = False
-    # Width of the Gaussian filter of the mask, as a share of the root of its area. The filtered
-    # mask falls outwards.
-    width = max(1.5, 0.02 * float(np.sqrt(np.count_nonzero(mask))))
-    outwards = np.pad(outward_directions(np.pad(mask, 1), width)[1:-1, 1:-1][rim], ((0, 0), (0, 1)))
-    values = observations[rim[mask]].astype(np.float64)
-    brightest = values.max(axis=1, keepdims=True, initial=0)
-    values = values / np.maximum(brightest, 1e-12)
-    lit = (values > 0.1).astype(np.float64)
-    bright = brightest[:, 0] > _DARK_SHARE * np.quantile(observations.max(axis=1), 0.99)
-    seen = (lit.sum(axis=1) >= 4) & bright & outwards.any(axis=1)
-    if not seen.any():
-        return np.empty((0, 3)), np.empty((0, 3))
-    fitted, _ = fit_robustly(values[seen], lit[seen] + 1e-3, light_directions, 6)
-    return unit(fitted), outwards[seen]
 
 
 # mean expected error of lights; larger ones are refused, as their normals would be useless

@@ -311,6 +311,11 @@ UNEQUAL_INTENSITIES = fault(
     " do not fit the images",
     "[Measure them](capture-and-calibrate.md#light-intensities), or correct the file",
 )
+UNKNOWN_MATERIAL = WarningKind(
+    "unknown_material",
+    "The object looks translucent, which flattens the normals with every method",
+    "Coat the object with a matte spray or powder, if it may be coated",
+)
 UNTRAINED_LIGHTS = WarningKind(
     "untrained_lights",
     "The weights were not trained with this number of lights",

@@ -1,0 +1,140 @@
+"""How likely each other reading of the images is right: a small network that compares all of them.
+
+Its features are the residuals under the readings (explanations.py), and what did not decide for
+them: how well three images explain all (the factors of light_fit.py, which do not depend on the
+lights), how well the lights fit these, and the curl of the normals, each before and after the
+reading. It was trained on rendered captures of all classes of materials, right ones and faulty ones
+(benchmarks/train_judge_net.py).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.resources import files
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from splinecli.judge.explanations import ALL_KINDS, Explanation
+from splinecli.judge.tilt import curl_of
+from splinecli.lights.outline import turn_at_outline
+from splinecli.maths import Float64Array
+from splinecli.maths.normals import angle_between_deg, spread_of, unit
+
+if TYPE_CHECKING:
+    from splinecli.judge.evidence import Evidence
+
+RIGHT, TRANSLUCENT, TILTED = "right", "translucent", "tilted"
+CLASSES = (RIGHT, TRANSLUCENT, TILTED, *ALL_KINDS)
+_LEAST = 3e-3  # added to residuals before a logarithm is taken
+
+
+class JudgeNet(NamedTuple):
+    """The weights of M perceptrons with one hidden layer, whose probabilities are averaged."""
+
+    mean: Float64Array  # (D,), of the features in training
+    deviation: Float64Array  # (D,), standard deviation
+    hidden: Float64Array  # (M, D, H)
+    hidden_bias: Float64Array  # (M, H)
+    output: Float64Array  # (M, H, C), of the CLASSES
+    output_bias: Float64Array  # (M, C)
+
+    def probabilities(self, features: Float64Array) -> Float64Array:
+        """Return the probabilities (..., C) of CLASSES from features (..., D)."""
+        # Beyond the features of training captures, the network is held constant.
+        scaled = ((features - self.mean) / self.deviation).clip(-3, 3)
+        hidden = np.tanh(np.einsum("...d,mdh->...mh", scaled, self.hidden) + self.hidden_bias)
+        logits = np.einsum("...mh,mhc->...mc", hidden, self.output) + self.output_bias
+        found = np.exp(logits - np.logaddexp.reduce(logits, axis=-1, keepdims=True))
+        return np.asarray(found.mean(axis=-2))
+
+
+@cache
+def judge_net() -> JudgeNet:
+    """Load the shipped network."""
+    from safetensors.numpy import load
+
+    stored = (files("splinecli") / "assets" / "judge-net.safetensors").read_bytes()
+    return JudgeNet(
+        **{name: np.asarray(values, np.float64) for name, values in load(stored).items()}
+    )
+
+
+def features_of(seen: Evidence) -> Float64Array | None:
+    """Return the features (D,) of the evidence, None if it has no readings.
+
+    Features of a reading that the lights do not determine are 0.
+    """
+    readings = seen.explanations.readings
+    if not readings:
+        return None
+    fits, before = seen.explanations, _measures(seen.coarse)
+    found = [
+        *np.log(before + _LEAST),
+        np.log(fits.given.residual + _LEAST),
+        np.log(len(seen.indices) / 10),
+        np.log(np.linalg.svd(seen.directions, compute_uv=False)[-1] / np.sqrt(len(seen.indices))),
+        np.log(spread_of(unit(fits.given.normals)) + 0.01),
+        fits.roundness,
+        float(seen.intensities_measured),
+        float(seen.estimated is not None),
+        float(seen.eight_bit),
+    ]
+    found += _of_tilt(seen)
+    for kind in ALL_KINDS:
+        reading = readings.get(kind)
+        if reading is None:
+            found += [0.0] * (3 + len(before))
+            continue
+        after = _measures(seen.coarse.read_as(reading))
+        found += [
+            np.log(reading.ratio),
+            _amount(reading),
+            float(np.std(np.log(reading.intensities))),
+            *(np.log(after + _LEAST) - np.log(before + _LEAST)),
+        ]
+    return np.asarray(np.nan_to_num(np.array(found)), np.float64)
+
+
+def _of_tilt(seen: Evidence) -> list[float]:
+    """Return what curl and outline say of a common tilt of the lights."""
+    tilt, lights = seen.tilt, seen.directions
+    found = [0.0] * 4
+    if tilt is not None:
+        found = [
+            float(np.log(tilt.left)),
+            float(np.log1p(tilt.degrees)),
+            float(np.log1p(max(tilt.significance, 0))),
+            float(np.log(tilt.left * tilt.curl + _LEAST)),
+        ]
+    coarse = seen.coarse.evened
+    turn = turn_at_outline(coarse.observations, coarse.mask, lights)
+    if tilt is None or turn is None:
+        return found + [0.0] * 5
+    turned = lights @ turn.share(1.0).T
+    curl = curl_of(coarse.observations, coarse.mask, turned)
+    agreement = float(np.median(angle_between_deg(turned, lights @ tilt.matrix.T)))
+    return [
+        *found,
+        1.0,
+        float(np.log1p(turn.angle_deg)),
+        turn.spread,
+        float(np.log(curl + _LEAST) - np.log(tilt.curl + _LEAST)),
+        float(np.log1p(agreement)),
+    ]
+
+
+def _amount(reading: Explanation) -> float:
+    return float(reading.amount if reading.kind == "curve" else np.log(reading.amount))
+
+
+def _measures(seen: Evidence) -> Float64Array:
+    """Return what three images leave unexplained, how far the lights are from them with intensities
+    as known and with free ones, and the curl of the normals; NaN is unknown.
+    """
+    curl = curl_of(seen.evened.observations, seen.evened.mask, seen.directions)
+    factors, lights = seen.factors, seen.directions[None]
+    if factors is None:
+        return np.array((np.nan, np.nan, np.nan, curl))
+    free = factors.with_free_intensities()
+    return np.array((factors.residual, *(f.misfits(lights)[0] for f in (factors, free)), curl))
