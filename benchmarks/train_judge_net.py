@@ -17,12 +17,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors.numpy import save_file
+from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from near_lamps import height_field, sphere
 from point_lights import render_point_lights
 from splinecli.capture import Capture
 from splinecli.capture.arrays import ArraySource
+from splinecli.capture.near_lamps import NearLamps
 from splinecli.images.lamps import estimate_light_intensities
 from splinecli.judge.evidence import Evidence
 from splinecli.judge.judge_net import CLASSES, RIGHT, TILTED, TRANSLUCENT, JudgeNet, features_of
@@ -39,7 +41,8 @@ from splinecli.workshop.synthesis.scenes import (
 
 Array = NDArray[np.float64]
 SHAPES = ("", "", "relief", "", "", "plane", "", "", "sphere", "", "", "low relief")
-MATERIALS_PER_SCENE, FAULTS_PER_CAPTURE = 3, 7
+ANALYTIC = ("ideal", "rough", TRANSLUCENT)  # materials that are not rendered
+MATERIALS_PER_SCENE, FAULTS_PER_CAPTURE = 4, 7
 PRIOR = {RIGHT: 0.9, TRANSLUCENT: 0.03}  # the other classes share the rest
 COLUMNS = ("features", "classes", "scenes", "materials")
 MEMBERS, HIDDEN, STEPS, FOLDS = 5, 16, 1500, 5
@@ -61,7 +64,10 @@ def draw_lights(rng: np.random.Generator) -> Array:
     count = int(np.exp(rng.uniform(np.log(6), np.log(40.9))))
     count = int(rng.integers(4, 6)) if rng.random() < 0.06 else count
     kind = rng.integers(5)
-    azimuth = np.linspace(0, 2 * np.pi, count, endpoint=False) + rng.uniform(0, 2 * np.pi)
+    z: NDArray[np.floating]
+    azimuth: NDArray[np.floating] = np.linspace(0, 2 * np.pi, count, endpoint=False) + rng.uniform(
+        0, 2 * np.pi
+    )
     if kind == 0:  # anywhere above the object
         z, azimuth = rng.uniform(0.4, 0.99, count), rng.uniform(0, 2 * np.pi, count)
     elif kind == 1:  # a ring
@@ -102,7 +108,9 @@ def render(seed: int, index: int) -> Iterator[Rendered]:
     )
     tracer = Tracer(scene.mesh)
     visible = find_visible_surface(tracer, size, 2)
-    names = list(rng.choice([*scene.materials, TRANSLUCENT], MATERIALS_PER_SCENE, replace=False))
+    names = list(
+        rng.choice([*scene.materials, *ANALYTIC, *ANALYTIC], MATERIALS_PER_SCENE, replace=False)
+    )
     surface = (
         {name: each for name, each in scene.materials.items() if name in names},
         scene.patch_of_face,
@@ -127,10 +135,37 @@ def render(seed: int, index: int) -> Iterator[Rendered]:
     for name, bounced in indirect.items():
         images = (distant[name] + bounced).numpy(), near[name].numpy() / falloff + bounced.numpy()
         yield Rendered(name, visible.mask, lights, *images)
-    if TRANSLUCENT in names:  # light that enters comes out beyond the terminator
-        wrap = rng.uniform(0.2, 0.7)
-        shade = (np.float64(visible.normals) @ lights.T + wrap).clip(0) / (1 + wrap)
-        yield Rendered(TRANSLUCENT, visible.mask, lights, shade, shade)
+    normals = np.asarray(visible.normals, np.float64)
+    albedo = np.exp(rng.normal(0, rng.choice((0.0, 0.3)), (len(normals), 1)))
+    lamps = NearLamps.of(positions / 2 * size, 1.0, visible.mask.shape, equal=True)
+    at, falls = lamps.light_at(lamps.plane_points(*np.nonzero(visible.mask)))
+    for name in set(names) & set(ANALYTIC):
+        strength = rng.uniform(0.2, 0.8)
+        far, close = (
+            albedo
+            * shading(
+                name, strength, (each * normals[:, None]).sum(axis=2), each[..., 2], normals[:, 2:]
+            )
+            for each in (lights, np.asarray(at, np.float64))
+        )
+        yield Rendered(name, visible.mask, lights, far, close * falls)
+
+
+def shading(name: str, strength: float, cosines: Array, light_z: Array, normal_z: Array) -> Array:
+    """Return the shading (P, F) of a material without cast shadows, under lights with the given z:
+    exactly matte; rough, after Oren and Nayar (1994); or translucent, so that light which enters
+    comes out beyond the terminator.
+    """
+    if name == TRANSLUCENT:
+        return np.asarray((cosines + strength).clip(0) / (1 + strength))
+    lit = cosines.clip(0)
+    if name == "ideal":
+        return lit
+    squared = 2 * strength**2
+    along = light_z - cosines * normal_z
+    along = np.where(along > 0, along / np.maximum(np.maximum(lit, normal_z), 0.05), along)
+    first, second = 1 - 0.5 * squared / (squared + 0.33), 0.45 * squared / (squared + 0.09)
+    return np.asarray(lit * (first + second * along).clip(0))
 
 
 def captures(scene: Rendered, rng: np.random.Generator) -> Iterator[tuple[str, Array, Array]]:
@@ -138,7 +173,7 @@ def captures(scene: Rendered, rng: np.random.Generator) -> Iterator[tuple[str, A
     first of the right capture.
     """
     count, peak = len(scene.lights), rng.choice((1.0, 1.0, 0.6, 0.3))
-    noise, bits = rng.choice((0.0005, 0.002, 0.005)), int(rng.choice((8, 16, 16, 16)))
+    noise, bits = rng.choice((0.0, 0.0005, 0.002, 0.005)), int(rng.choice((8, 16, 16, 16)))
 
     def stored(light: Array, gamma: float | None = 1.0) -> Array:
         values = peak * light / np.quantile(light, rng.choice((0.98, 0.999)))
@@ -157,6 +192,11 @@ def captures(scene: Rendered, rng: np.random.Generator) -> Iterator[tuple[str, A
     place = rng.integers(count)
     odd = light.copy()
     odd[:, place] = light[:, (place + 1) % count]
+    images = np.zeros((count, *scene.mask.shape))
+    images[:, scene.mask] = light.T
+    blur = (0, *[rng.uniform(1, 4)] * 2)
+    moved = images.copy()
+    moved[: count // 2] = np.roll(moved[: count // 2], rng.integers(2, 6), axis=1 + count % 2)
     faults = [
         ("curve", lambda: stored(light, None), lights),
         ("curve", lambda: stored(light, rng.choice((1.8, 2.2, 2.4))), lights),
@@ -170,6 +210,8 @@ def captures(scene: Rendered, rng: np.random.Generator) -> Iterator[tuple[str, A
         (right, lambda: stored(light), np.roll(lights, 1, axis=0)),
         (TILTED, lambda: stored(light), lights @ Rotation.from_rotvec(-axis).as_matrix().T),
         (right, lambda: stored(odd), lights),
+        (right, lambda: stored(gaussian_filter(images, blur)[:, scene.mask].T), lights),
+        (right, lambda: stored(moved[:, scene.mask].T), lights),
     ]
     if right == RIGHT:
         faults.append(("near", lambda: stored(scene.near), lights))
@@ -256,7 +298,7 @@ def fit(features: Array, classes: NDArray[np.int64], weights: Array) -> JudgeNet
 def train(paths: Sequence[Path], output: Path | None) -> None:
     """Print the errors of networks on scenes that they were not trained on, and save one of all."""
     stored = [dict(np.load(path)) for path in paths]
-    features = np.concatenate([each["features"] for each in stored])
+    features = np.concatenate([each["features"] for each in stored]).clip(-15, 15)
     classes = np.concatenate([each["classes"] for each in stored])
     materials = np.concatenate([each["materials"] for each in stored])
     scenes = np.concatenate([place * 100_000 + each["scenes"] for place, each in enumerate(stored)])

@@ -92,7 +92,7 @@ def test_a_warning_is_a_row(monkeypatch):
 
     def check(seen):
         return (
-            [CaptureWarning(uniform, "All values are equal.")]
+            [checks.Finding(CaptureWarning(uniform, "All values are equal."))]
             if np.ptp(seen.observations) == 0
             else []
         )

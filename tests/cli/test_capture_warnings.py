@@ -54,10 +54,16 @@ def test_shifted_images_are_named(run, medallion):
         " down."
     )
     result = run("infer", medallion, "--method", "ls")
-    assert result.code == 0 and words in result.err
+    assert result.code == 0 and words in result.err and "The images were aligned to" in result.err
+    aligned = json.loads(Path("out/medallion/report.json").read_text("utf-8"))
+    assert aligned["mended"] == ["images_shifted"]
+    run("infer", medallion, "--method", "ls", "--as-stored", "--overwrite")
+    stored = json.loads(Path("out/medallion/report.json").read_text("utf-8"))
+    assert stored["mended"] == []
+    assert aligned["angular_error_deg"]["mean"] < stored["angular_error_deg"]["mean"]
     assert "images_shifted" in codes()
     info = run("info", medallion, "--json")
-    assert words in info.err and "images_shifted" in json.loads(info.out)["warning_codes"]
+    assert words in info.err and "images_aligned" in json.loads(info.out)["warning_codes"]
     assert words.removesuffix(".") in refused(run, "--method", "ls")
 
 
@@ -148,7 +154,7 @@ def test_python_gives_the_same_warnings(medallion):
     ]
     assert all(warning.filename == __file__ for warning in caught)
     assert "images[3] 2 right 1 up" in str(caught[0].message)
-    assert "run again with --light-frame y-down" in str(caught[1].message)
+    assert "Run again with --light-frame y-down" in str(caught[1].message)
 
 
 LIGHTS = spiral_lights(10, 55, 12)

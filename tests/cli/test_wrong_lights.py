@@ -19,21 +19,24 @@ def write_lights(folder: Path, change) -> None:
     np.savetxt(folder / "light_directions.txt", change(lights), fmt="%.6f")
 
 
-def test_infer_names_a_flipped_axis_and_the_frame_mends_it(run, medallion):
+def test_a_flipped_axis_is_mended_unless_a_frame_is_given(run, medallion):
     write_lights(medallion, lambda lights: lights * (1, -1, 1))
-    result = run("infer", medallion, "--method", "ls")
-    assert result.code == 0
-    assert "with y negated (curl 0.03 against 0.52, outline +1.00 against -0.00)" in result.err
-    assert "run again with --light-frame y-down." in result.err
-    report = read_report(Path("out/medallion"))
-    assert [warning["code"] for warning in report["warnings"]] == ["light_frame"]
-    wrong = report["angular_error_deg"]["mean"]
-
-    mended = run("infer", medallion, "--method", "ls", "--light-frame", "y-down", "--overwrite")
-    assert (mended.code, mended.err) == (0, "")
-    report = read_report(Path("out/medallion"))
-    assert report["options"]["light_frame"] == "y-down"
-    assert report["angular_error_deg"]["mean"] < wrong / 5
+    found = {}
+    for frame in ("as they come", "x-right,y-up", "y-down"):
+        options = [] if frame == "as they come" else ["--light-frame", frame]
+        found[frame] = run("infer", medallion, "--method", "ls", *options, "--overwrite")
+        report = read_report(Path("out/medallion"))
+        found[frame] = (found[frame], report["angular_error_deg"]["mean"], report["mended"])
+    why = "with y negated (curl 0.03 against 0.52, outline +1.00 against -0.00). "
+    mended, kept, given = found.values()
+    assert f"{why}They were corrected; --light-frame x-right,y-up keeps" in mended[0].err
+    assert f"{why}Run again with --light-frame y-down." in kept[0].err
+    assert given[0].err == ""
+    assert [each[0].code for each in found.values()] == [0, 0, 0]
+    assert mended[1] == given[1] < kept[1] / 5
+    assert (mended[2], kept[2], given[2]) == (["light_frame"], [], [])
+    refused = run("infer", medallion, "--method", "ls", "--strict", "--overwrite")
+    assert refused.code == 3 and "Leave --strict out to go on with this corrected." in refused.err
 
 
 def test_lights_that_all_point_away(run, medallion):
@@ -48,7 +51,7 @@ def test_strict_writes_nothing_and_ends_with_3(run, medallion):
     result = run("infer", medallion, "--method", "ls", "--strict")
     assert (result.code, result.out) == (3, "")
     assert "much better if image 1 belongs to light 2, image 2 to the next, and so on" in result.err
-    assert "Leave --strict out to go on nevertheless." in result.err
+    assert "Leave --strict out to go on with this corrected." in result.err
     assert not Path("out/medallion").exists()
 
 

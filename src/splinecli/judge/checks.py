@@ -29,8 +29,7 @@ from splinecli.records.capture_warnings import CaptureWarning, WarningKind
 
 LEAST_EXPECTED = 0.1  # smallest expected share of normals within 5 degrees without a warning
 # Largest ratio of residuals at which another reading shows that lights and images belong together:
-# with wrong or moved ones, no reading reduces the residual as much. Intensities are an exception:
-# on flat objects they explain any order.
+# with wrong or moved ones, no reading reduces the residual as much.
 DECISIVE = 0.35
 _MOST_NAMED = 4  # shifted images in a sentence
 _TRANSLUCENT_DEG = 8.0  # the usual median error of normals of translucent objects
@@ -51,16 +50,28 @@ def shifted_images(seen: Evidence) -> Iterator[Finding]:
     shifts, names = seen.shifts, seen.names
     if not shifts:
         return
+    after = seen.moved_back(shifts)
+    if not (seen.found or _explains_more(after, seen)):
+        return
     named = ", ".join(f"{names[shift.place]} {shift}" for shift in shifts[:_MOST_NAMED])
     more = f" and {len(shifts) - _MOST_NAMED} more" if len(shifts) > _MOST_NAMED else ""
-    text = (
+    cause = (
         f"{len(shifts)} of {len(names)} images {'is' if len(shifts) == 1 else 'are'} shifted"
-        f" against the others, in pixels: {named}{more}. The camera or the object moved. Add"
-        " --align, or photograph from a tripod."
+        f" against the others, in pixels: {named}{more}. The camera or the object moved."
     )
-    yield Finding(
-        CaptureWarning(codes.IMAGES_SHIFTED, text, seen.shift_error_deg), seen.moved_back(shifts)
-    )
+    text = f"{cause} Add --align, or photograph from a tripod."
+    warning = CaptureWarning(codes.IMAGES_SHIFTED, text, seen.shift_error_deg)
+    yield Finding(warning, after, not seen.found, cause)
+
+
+def _explains_more(after: Evidence, before: Evidence) -> bool:
+    """Return whether three images explain the others better after images were moved back, and the
+    normals have no more curl.
+    """
+    if after.factors is None or before.factors is None or not (after.tilt and before.tilt):
+        return False
+    explained = after.factors.residual < 0.95 * before.factors.residual
+    return explained and after.tilt.curl < 1.05 * before.tilt.curl
 
 
 def other_scale(seen: Evidence) -> Iterator[Finding]:
@@ -73,7 +84,12 @@ def other_scale(seen: Evidence) -> Iterator[Finding]:
     for place, name in enumerate(seen.names):
         if np.count_nonzero(lit[:, place]) < 30:
             continue
-        factor = float(np.median(values[lit[:, place], place] / predicted[lit[:, place], place]))
+        ratios = values[lit[:, place], place] / predicted[lit[:, place], place]
+        factor = float(np.median(ratios))
+        # Gloss and shadow scale pixels differently.
+        alike = np.abs(ratios / max(factor, 1e-12) - 1) < 0.3
+        if alike.mean() < 0.6:
+            continue
         stops = abs(np.log2(max(factor, 1e-6)))
         # The bits that cameras of 12, 10 and 8 bits leave unused in 16-bit files, and by how many
         # bits the brightness of an image may differ from them.
@@ -239,18 +255,20 @@ def decisive_readings(seen: Evidence) -> Iterator[Finding]:
     """Warn of images that other readings explain so much better that lights and images must belong
     together.
     """
-    return other_readings(seen, DECISIVE)
+    return other_readings(seen, DECISIVE, CLEAR)
 
 
-def other_readings(seen: Evidence, largest_ratio: float = 1.0) -> Iterator[Finding]:
+def other_readings(
+    seen: Evidence, largest_ratio: float = 1.0, least: float = LIKELY
+) -> Iterator[Finding]:
     """Warn of images that fit much better if they are read in another way; see explanations.py.
 
     Each reading is accepted before the others are asked again. Readings that leave more than the
-    largest ratio of the residual are not named.
+    largest ratio of the residual, or are less probable than `least`, are not named.
     """
-    while (doubt := seen.doubt) is not None and doubt.probability >= LIKELY:
+    while (doubt := seen.doubt) is not None:
         reading = doubt.reading
-        if reading.ratio > largest_ratio or (reading.kind == "intensities" and largest_ratio < 1):
+        if reading.ratio > largest_ratio or doubt.probability < least:
             return
         after = seen.read_as(reading)
         error_deg = seen.explanations.error_deg(reading, seen.estimated)
@@ -395,6 +413,8 @@ class Check:
 # faults before it are mended.
 CHECKS = [
     Check(same_images, needs_lights=False),
+    Check(lights_near_axis),
+    Check(crowded_lights),
     Check(decisive_readings),
     Check(shifted_images, needs_lights=False),
     Check(other_scale),
@@ -402,8 +422,6 @@ CHECKS = [
     Check(wrong_lights),
     Check(missing_mask, needs_lights=False),
     Check(few_lights, needs_lights=False),
-    Check(lights_near_axis),
-    Check(crowded_lights),
     Check(other_readings),
     Check(tilted_lights),
     Check(strange_material),
@@ -522,13 +540,15 @@ def check_confidence(expected_under_5: float | None) -> list[CaptureWarning]:
     return [CaptureWarning(codes.LOW_CONFIDENCE, text)]
 
 
-def refuse_if_strict(warnings: Iterable[CaptureWarning], name: str, *, strict: bool) -> None:
+def refuse_if_strict(
+    warnings: Iterable[CaptureWarning], name: str, *, strict: bool, mends: bool = False
+) -> None:
     """Raise InputError for the first warning that says that an input is probably wrong, if
-    `strict`.
+    `strict`. `mends` is whether it would be mended otherwise.
     """
     wrong = next((warning for warning in warnings if warning.is_error), None)
     if strict and wrong is not None:
+        how = "with this corrected" if mends else "nevertheless"
         raise InputError(
-            f"{name}: {wrong.text.removesuffix('.')}",
-            hint="Leave --strict out to go on nevertheless",
+            f"{name}: {wrong.text.removesuffix('.')}", hint=f"Leave --strict out to go on {how}"
         )

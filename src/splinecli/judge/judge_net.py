@@ -11,22 +11,47 @@ from __future__ import annotations
 
 from functools import cache
 from importlib.resources import files
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from splinecli.judge.explanations import ALL_KINDS, Explanation
-from splinecli.judge.tilt import curl_of
+from splinecli.capture.sample import Sample
+from splinecli.judge.explanations import ALL_KINDS, Explanation, Explanations
+from splinecli.judge.tilt import Tilt, curl_of
+from splinecli.lights.light_fit import Factors
 from splinecli.lights.outline import turn_at_outline
 from splinecli.maths import Float64Array
 from splinecli.maths.normals import angle_between_deg, spread_of, unit
 
-if TYPE_CHECKING:
-    from splinecli.judge.evidence import Evidence
-
 RIGHT, TRANSLUCENT, TILTED = "right", "translucent", "tilted"
 CLASSES = (RIGHT, TRANSLUCENT, TILTED, *ALL_KINDS)
+_LARGEST = 15.0  # absolute value of a feature
 _LEAST = 3e-3  # added to residuals before a logarithm is taken
+
+
+class Judged(Protocol):
+    """What the features are taken from; see Evidence."""
+
+    @property
+    def directions(self) -> Float64Array: ...
+    @property
+    def evened(self) -> Sample: ...
+    @property
+    def factors(self) -> Factors | None: ...
+    @property
+    def explanations(self) -> Explanations: ...
+    @property
+    def tilt(self) -> Tilt | None: ...
+    @property
+    def intensities_measured(self) -> bool: ...
+    @property
+    def estimated(self) -> Float64Array | None: ...
+    @property
+    def eight_bit(self) -> bool: ...
+    @property
+    def coarse(self) -> Judged: ...
+
+    def read_as(self, reading: Explanation) -> Judged: ...
 
 
 class JudgeNet(NamedTuple):
@@ -60,7 +85,7 @@ def judge_net() -> JudgeNet:
     )
 
 
-def features_of(seen: Evidence) -> Float64Array | None:
+def features_of(seen: Judged) -> Float64Array | None:
     """Return the features (D,) of the evidence, None if it has no readings.
 
     Features of a reading that the lights do not determine are 0.
@@ -72,8 +97,8 @@ def features_of(seen: Evidence) -> Float64Array | None:
     found = [
         *np.log(before + _LEAST),
         np.log(fits.given.residual + _LEAST),
-        np.log(len(seen.indices) / 10),
-        np.log(np.linalg.svd(seen.directions, compute_uv=False)[-1] / np.sqrt(len(seen.indices))),
+        np.log(len(seen.directions) / 10),
+        np.log(np.linalg.svd(seen.directions, compute_uv=False)[-1] / len(seen.directions) ** 0.5),
         np.log(spread_of(unit(fits.given.normals)) + 0.01),
         fits.roundness,
         float(seen.intensities_measured),
@@ -93,10 +118,11 @@ def features_of(seen: Evidence) -> Float64Array | None:
             float(np.std(np.log(reading.intensities))),
             *(np.log(after + _LEAST) - np.log(before + _LEAST)),
         ]
-    return np.asarray(np.nan_to_num(np.array(found)), np.float64)
+    # A plane has no curl, whose logarithm is infinite.
+    return np.asarray(np.nan_to_num(np.array(found)).clip(-_LARGEST, _LARGEST), np.float64)
 
 
-def _of_tilt(seen: Evidence) -> list[float]:
+def _of_tilt(seen: Judged) -> list[float]:
     """Return what curl and outline say of a common tilt of the lights."""
     tilt, lights = seen.tilt, seen.directions
     found = [0.0] * 4
@@ -128,7 +154,7 @@ def _amount(reading: Explanation) -> float:
     return float(reading.amount if reading.kind == "curve" else np.log(reading.amount))
 
 
-def _measures(seen: Evidence) -> Float64Array:
+def _measures(seen: Judged) -> Float64Array:
     """Return what three images leave unexplained, how far the lights are from them with intensities
     as known and with free ones, and the curl of the normals; NaN is unknown.
     """

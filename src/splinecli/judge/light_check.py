@@ -33,7 +33,12 @@ from splinecli.records.capture_warnings import CaptureWarning, WarningKind
 # The advantage of a frame: the weight of a difference of rims, the smallest difference that
 # distinguishes two frames, and the advantage that any rotation needs, because its angle is fitted.
 # From 1 on, a frame is better.
-_RIM_WEIGHT, _TOLD_APART, _ROTATED = 1.0, 0.5, 2.0
+_RIM_WEIGHT, _TOLD_APART, _ROTATED = 1.0, 0.5, 4.0
+
+
+# Lights of metals, of which three images leave more, are only doubted. Others that are corrected
+# leave at most the second share of the residual of random orders.
+_METALLIC, _FITS_WELL = 0.25, 0.25
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,7 @@ class LightCheck:
     shadows_tell: bool = False  # whether cast shadows exclude the given lights with x and y negated
     # whether they contradict the given lights, without supporting others
     lacks_shadows: bool = False
+    residual: float = 0.0  # what three images leave of all others, as a share of the brightness
     # an image that contradicts the others, without which all this was found
     odd_image: OddImage | None = None
 
@@ -109,9 +115,10 @@ class LightCheck:
         """Whether the better reading is so much better that the lights are mended without being
         asked.
         """
-        if self.order is not None and not self.order_misfit < 0.5 * self.given_misfit:
+        if self.mended is None or self.residual > _METALLIC:
             return False
-        return self.mended is not None and (self.best is None or self.best.advantage >= 2)
+        better = self.order_misfit < min(0.5 * self.given_misfit, _FITS_WELL)
+        return (self.order is None or better) and (self.best is None or self.best.advantage >= 2)
 
     @property
     def outline_tells(self) -> bool:
@@ -231,6 +238,7 @@ def _check_frame_and_order(
         mended=mended if clear else None,
         error_deg=turn_deg,
         shadows_tell=shadows_tell,
+        residual=0.0 if factors is None else factors.residual,
         lacks_shadows=lacks_shadows and not (order or best or check.outline_tells),
     )
 
@@ -372,12 +380,11 @@ def light_warnings(
             f"Under the lights of {light_file.name}, the surface should cast shadows that are not"
             " in the images. With x and y of the lights negated, bumps become hollows, and fewer"
             " shadows are missing. The images do not decide which is right. Compare bumps and"
-            " hollows with the object. If they are exchanged, run again with --light-frame"
-            f" {BOTH_NEGATED.after(frame)}."
+            " hollows with the object. If they are exchanged, negate x and y of the lights."
         )
-        # A bump looks the same as a hollow. With this error, about a quarter of the normals of a
-        # good capture are expected within 5 degrees.
-        found.append((CaptureWarning(codes.LIGHTS_UNCHECKED, text, 10.0), ""))
+        # A bump looks the same as a hollow. With this error, less than half of the normals are
+        # expected within 5 degrees.
+        found.append((CaptureWarning(codes.LIGHTS_UNCHECKED, text, 6.0), ""))
     if strict and check.unchecked:
         text = (
             f"The lights of {light_file.name} could not be fully verified. Unchecked:"

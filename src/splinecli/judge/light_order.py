@@ -37,6 +37,7 @@ LARGEST_MENDED = 0.35  # residual of a better order; right lights of most metals
 _FOR_CHANCE = 8  # fewer lights fit in too many random orders; they use known intensities
 _RANDOM = 0.05  # of the brightness; below it, free intensities do not determine the order
 _FEWEST_IN_RING = 4
+_MATTE = 0.2  # what the factors leave of the brightness of a material that is not metal
 _EQUAL = 1e-3  # share of the residual by which equal readings may differ
 _FITTED_PIXELS, _FITS = 800, 5
 UNKNOWN_ORDER = "unknown"  # the order of the lights does not fit, and no simple other one does
@@ -278,11 +279,13 @@ def check_order(
     ):
         found = tried[-1]
     else:
-        found = _better(given, [*shifts, of_angles], exchanged, usual)
+        # Tilted lights and metals fit zenith angles better than elevations, though not well.
+        are_zenith = factors.residual < _MATTE and of_angles.misfit < 0.25 * usual
+        found = _better(given, [*shifts, *[of_angles] * are_zenith], exchanged, usual)
         if found.misfit > 0.1 * usual and np.array_equal(chosen, np.arange(n_all)):
             rings = _Reading(*mend_rings(compared, lights))
             tried += [rings] if rings.words else []
-            if rings.words and rings.misfit < min(found.misfit * 0.75, LARGEST_MENDED * usual):
+            if rings.words and rings.misfit < min(found.misfit * 0.6, LARGEST_MENDED * usual):
                 found = rings
     # On glossy plates, free intensities hide an order that fits well under the known ones.
     fits_known = factors.intensities_known and _is_plausible(factors, given, usual)
@@ -313,7 +316,8 @@ def _better(
     best = min(others, key=lambda reading: reading.misfit)
     if share > 0.25 and best.misfit < limit:  # a wrong order has a larger residual
         return best
-    if share > 0.08 and exchanged.misfit < limit:  # where two lights are exchanged
+    # where two lights are exchanged
+    if share > 0.08 and exchanged.misfit < min(0.4 * given.misfit, limit):
         return exchanged
     return given
 
@@ -323,6 +327,8 @@ def _are_half_vectors(
 ) -> bool:
     """Return whether the lights (F, 3) with doubled angles from the axis fit clearly better."""
     better = False
+    if factors.residual > _MATTE:
+        return False
     for known in (True, False):
         compared = replace(factors, intensities_known=known)
         usual = float(np.median(random_misfits(compared, lights)))

@@ -179,7 +179,9 @@ def estimate_capture(
     work = follow(work, "judgement", "mending")
     prepared = work.made.warnings
     judged = work.judgement.warnings if work.judgement else ()
-    refuse_if_strict([*prepared, *judged], work.made.name, strict=strict)
+    remedy = work.judgement.remedy if work.judgement else None
+    mends = remedy is not None and not (work.options.keeps_lights or work.options.as_stored)
+    refuse_if_strict([*prepared, *judged], work.made.name, strict=strict, mends=mends)
     capture = follow(work, "refinement", "refinement").made
     if work.options.refine_lights:
         judged = tuple(warning for warning in judged if warning.kind != ROUGH_LIGHTS)

@@ -37,6 +37,7 @@ from splinecli.recipe.work import USUAL, RecipeOptions, Work
 from splinecli.records.capture_warnings import (
     CURVE_MENDED,
     ESTIMATED_INTENSITIES,
+    IMAGES_ALIGNED,
     LIGHTS_MENDED,
     CaptureWarning,
     estimated_lights,
@@ -236,9 +237,15 @@ def mend(work: Work, _: Callable[[], object]) -> Work:
     left = () if mended.judgement is None else mended.judgement.warnings
     if any(warning.is_error for warning in left):
         return work
+    prepared = [
+        replace(each, text=f"{causes} {each.text} --as-stored keeps their places.")
+        if remedy.align and each.kind is IMAGES_ALIGNED
+        else each
+        for each in mended.made.warnings
+    ]
     capture = replace(
         mended.made,
-        warnings=(*mended.made.warnings, *notes),
+        warnings=(*prepared, *notes),
         mended=tuple(fault.warning.code for fault in remedy.faults),
     )
     kept = judgement._replace(warnings=left)
