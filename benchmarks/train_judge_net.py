@@ -45,7 +45,7 @@ ANALYTIC = ("ideal", "rough", TRANSLUCENT)  # materials that are not rendered
 MATERIALS_PER_SCENE, FAULTS_PER_CAPTURE = 4, 7
 PRIOR = {RIGHT: 0.9, TRANSLUCENT: 0.03}  # the other classes share the rest
 COLUMNS = ("features", "classes", "scenes", "materials")
-MEMBERS, HIDDEN, STEPS, FOLDS = 5, 16, 1500, 5
+MEMBERS, HIDDEN, STEPS, FOLDS = 8, 32, 800, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,12 +276,13 @@ def fit(features: Array, classes: NDArray[np.int64], weights: Array) -> JudgeNet
         net = torch.nn.Sequential(
             torch.nn.Linear(scaled.shape[1], HIDDEN),
             torch.nn.Tanh(),
+            torch.nn.Dropout(0.3),
             torch.nn.Linear(HIDDEN, len(CLASSES)),
         )
-        optimizer = torch.optim.AdamW(net.parameters(), 1e-2, weight_decay=1.0)
+        optimizer = torch.optim.AdamW(net.parameters(), 1e-2, weight_decay=0.5)
         for step in range(STEPS):
             optimizer.param_groups[0]["lr"] = 1e-2 * (1 - step / STEPS)
-            noisy = scaled + 0.1 * torch.randn_like(scaled)
+            noisy = scaled + 0.2 * torch.randn_like(scaled)
             losses = torch.nn.functional.cross_entropy(net(noisy), right, reduction="none")
             optimizer.zero_grad()
             (weight * losses).sum().backward()

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from splinecli.capture import Capture
-from splinecli.capture.record import side_of
 from splinecli.capture.sample import leave_out_background
 from splinecli.capture.source import Source
 from splinecli.errors import InputError
@@ -27,6 +26,10 @@ from splinecli.maths.robust import fit_robustly
 from splinecli.records import capture_warnings as codes
 from splinecli.records.capture_warnings import CaptureWarning, WarningKind
 
+TILT_ADVICE = (
+    "They may have been measured in another frame than the camera's, such as the table's. Tilt them"
+    " back"
+)
 LEAST_EXPECTED = 0.1  # smallest expected share of normals within 5 degrees without a warning
 # Largest ratio of residuals at which another reading shows that lights and images belong together:
 # with wrong or moved ones, no reading reduces the residual as much.
@@ -210,15 +213,8 @@ def tilted_lights(seen: Evidence) -> Iterator[Finding]:
     if seen.has_positions or tilt is None or probability < LIKELY:
         return
     mended = seen.directions @ tilt.matrix.T
-    cause = (
-        f"The lights of {seen.origin.name} look tilted together, by {tilt.degrees:.0f} degrees"
-        f" towards the {side_of(tilt.towards_deg)}: tilted back, they give normals that fit a"
-        f" surface better (curl {tilt.left * tilt.curl:.3f} against {tilt.curl:.3f})."
-    )
-    text = (
-        f"{cause} They may have been measured in another frame than the camera's, such as the"
-        f" table's. Tilt them back, as {WRITES_MENDED} does."
-    )
+    cause = f"The lights of {seen.origin.name} {tilt.cause}"
+    text = f"{cause} {TILT_ADVICE}, as {WRITES_MENDED} does."
     error_deg = median_turn_deg(seen.observations, seen.directions, mended)
     warning = CaptureWarning(codes.LIGHTS_TILTED, text, error_deg)
     yield Finding(warning, seen.under_lights(mended), probability > CLEAR, cause)

@@ -17,10 +17,10 @@ import numpy as np
 
 from splinecli.capture.sample import Sample
 from splinecli.judge.explanations import ALL_KINDS, Explanation, Explanations
-from splinecli.judge.tilt import Tilt, curl_of
+from splinecli.judge.tilt import Tilt, curl_of, fitted_normals
 from splinecli.lights.light_fit import Factors
 from splinecli.lights.outline import turn_at_outline
-from splinecli.maths import Float64Array
+from splinecli.maths import Float64Array, Floats
 from splinecli.maths.normals import angle_between_deg, spread_of, unit
 
 RIGHT, TRANSLUCENT, TILTED = "right", "translucent", "tilted"
@@ -36,6 +36,8 @@ class Judged(Protocol):
     def directions(self) -> Float64Array: ...
     @property
     def evened(self) -> Sample: ...
+    @property
+    def normals(self) -> Floats: ...
     @property
     def factors(self) -> Factors | None: ...
     @property
@@ -138,7 +140,7 @@ def _of_tilt(seen: Judged) -> list[float]:
     if tilt is None or turn is None:
         return found + [0.0] * 5
     turned = lights @ turn.share(1.0).T
-    curl = curl_of(coarse.observations, coarse.mask, turned)
+    curl = curl_of(fitted_normals(coarse.observations, coarse.mask, turned), coarse.mask)
     agreement = float(np.median(angle_between_deg(turned, lights @ tilt.matrix.T)))
     return [
         *found,
@@ -158,7 +160,7 @@ def _measures(seen: Judged) -> Float64Array:
     """Return what three images leave unexplained, how far the lights are from them with intensities
     as known and with free ones, and the curl of the normals; NaN is unknown.
     """
-    curl = curl_of(seen.evened.observations, seen.evened.mask, seen.directions)
+    curl = curl_of(seen.normals, seen.evened.mask)
     factors, lights = seen.factors, seen.directions[None]
     if factors is None:
         return np.array((np.nan, np.nan, np.nan, curl))

@@ -15,12 +15,13 @@ import numpy as np
 from scipy.ndimage import binary_erosion, gaussian_filter
 from scipy.spatial.transform import Rotation
 
+from splinecli.capture.record import side_of
 from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.maths.normals import unit
 from splinecli.maths.robust import fit_robustly, shadow_weights
 
 _FITS = 5
-_MAX_PIXELS = 1500
+_GRID_PIXELS, _MAX_PIXELS = 12_000, 1500  # of the grid, and those of it that are used
 _SMOOTHING = 1.0  # standard deviation in pixels of the smoothing of the normals
 _LEAST_Z = 0.34  # slants beyond 70 degrees are left out
 _LEAST_SHARE = 0.6  # of the pixels that count as given, after a tilt
@@ -38,12 +39,28 @@ class Tilt(NamedTuple):
     significance: float
     matrix: Float64Array  # (3, 3) M, where lights @ M' are tilted back
 
+    @property
+    def is_clear(self) -> bool:
+        """Whether normals that a network estimated leave no doubt. The normals of rendered metals
+        and the most reflecting hollows under right lights do not reach this.
+        """
+        return 8 <= self.degrees <= 35 and self.left <= 0.84 and self.significance >= 2.2
 
-def find_tilt(observations: Floats, mask: Bools, light_directions: Float64Array) -> Tilt | None:
-    """Return the tilt of lights (F, 3) that observations (P, F) at the pixels of a mask (H, W) show
-    best; None if too few pixels have neighbours.
+    @property
+    def cause(self) -> str:
+        """The tilt and its evidence, as a sentence about lights."""
+        return (
+            f"look tilted together, by {self.degrees:.0f} degrees towards the"
+            f" {side_of(self.towards_deg)}: tilted back, they give normals that fit a surface"
+            f" better (curl {self.left * self.curl:.3f} against {self.curl:.3f})."
+        )
+
+
+def find_tilt(normals: Floats, mask: Bools) -> Tilt | None:
+    """Return the tilt of the lights that normals (H, W, 3) in a mask (H, W) show best; None if too
+    few pixels have neighbours.
     """
-    vectors = _derivatives(observations, mask, light_directions)
+    vectors = _derivatives(normals, mask)
     if vectors is None:
         return None
     tilts = [np.zeros((1, 2)), *(_around_axis(degrees, _AZIMUTHS_DEG) for degrees in _TILTS_DEG)]
@@ -66,29 +83,36 @@ def find_tilt(observations: Floats, mask: Bools, light_directions: Float64Array)
     return Tilt(float(np.hypot(x, y)), towards, float(curls[0]), left, significance, matrix)
 
 
-def curl_of(observations: Floats, mask: Bools, light_directions: Float64Array) -> float:
-    """Return the curl of the normals that lights (F, 3) give, NaN for too few pixels; see Tilt."""
-    vectors = _derivatives(observations, mask, light_directions)
+def curl_of(normals: Floats, mask: Bools) -> float:
+    """Return the curl of normals (H, W, 3) in a mask (H, W), NaN for too few pixels; see Tilt."""
+    vectors = _derivatives(normals, mask)
     return float("nan") if vectors is None else float(_curls(vectors, np.zeros((1, 2)), 0.0).sum())
 
 
-def _derivatives(
-    observations: Floats, mask: Bools, light_directions: Float64Array
-) -> Float64Array | None:
-    """Return normals and their derivatives to the right and upwards (3, p, 3), at some pixels with
-    neighbours; None for too few.
+def fitted_normals(observations: Floats, mask: Bools, light_directions: Float64Array) -> Floats:
+    """Return the normals (H, W, 3) that lights (F, 3) give robustly; observations (P, F) are of the
+    pixels of a mask (H, W).
     """
-    inside = binary_erosion(mask)
-    if np.count_nonzero(inside) < 50 or min(mask.shape) < 2:
-        return None
     values = observations.astype(np.float64)
     values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
     normals = np.zeros((*mask.shape, 3))
     normals[mask] = unit(fit_robustly(values, shadow_weights(values), light_directions, _FITS)[0])
-    normals = unit(gaussian_filter(normals, (_SMOOTHING, _SMOOTHING, 0)))
-    downwards, right = np.gradient(normals, axis=(0, 1))
-    step = -(-np.count_nonzero(inside) // _MAX_PIXELS)
-    return np.stack([each[inside][::step] for each in (normals, right, -downwards)])
+    return normals
+
+
+def _derivatives(normals: Floats, mask: Bools) -> Float64Array | None:
+    """Return normals and their derivatives to the right and upwards (3, p, 3), at some pixels with
+    neighbours; None for too few.
+    """
+    step = max(1, round(np.sqrt(np.count_nonzero(mask) / _GRID_PIXELS)))
+    mask, normals = mask[::step, ::step], normals[::step, ::step]
+    inside = binary_erosion(mask)
+    if np.count_nonzero(inside) < 50 or min(mask.shape) < 2:
+        return None
+    smooth = unit(gaussian_filter(np.float64(normals), (_SMOOTHING, _SMOOTHING, 0)))
+    downwards, right = np.gradient(smooth, axis=(0, 1))
+    every = -(-np.count_nonzero(inside) // _MAX_PIXELS)
+    return np.stack([each[inside][::every] for each in (smooth, right, -downwards)])
 
 
 def _around_axis(degrees: float, azimuths_deg: Float64Array) -> Float64Array:

@@ -25,7 +25,8 @@ from splinecli.errors import OutputError, SplinecliError, UsageError
 from splinecli.estimate.inference import NormalEstimate, estimate_normals, find_surface, lighting_on
 from splinecli.estimate.methods import DEFAULT_METHOD, Estimator, MethodOptions, make_estimator
 from splinecli.estimate.methods.estimator import FEWEST_TO_DISTIL, student_sizes
-from splinecli.judge.checks import check_confidence, refuse_if_strict
+from splinecli.judge.checks import TILT_ADVICE, check_confidence, refuse_if_strict
+from splinecli.judge.tilt import find_tilt
 from splinecli.lights.draws import draw_lights
 from splinecli.maths import Bools, Float32Array
 from splinecli.pictures.maps import encode_png
@@ -37,6 +38,8 @@ from splinecli.recipe.steps import begin, follow, images_to_read
 from splinecli.recipe.work import Work
 from splinecli.records.capture_warnings import (
     EIGHT_BIT,
+    LIGHTS_MENDED,
+    LIGHTS_TILTED,
     NOT_DISTILLED,
     ROUGH_LIGHTS,
     UNTRAINED_LIGHTS,
@@ -75,6 +78,11 @@ if TYPE_CHECKING:
 BASE_BYTES = 500 * 2**20
 # most pixels refined at once (a tile with its margin); bytes per pixel
 REFINED_PIXELS, REFINED_BYTES = (736**2, 1100)
+
+
+# A network follows a tilt of its lights only in part, so that it is undone in steps, of which each
+# reduces the curl to the share or less.
+_TILTS, _LEAST_FALL, _SMALL_TILT_DEG = 3, 0.95, 4.0
 
 
 def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
@@ -194,7 +202,11 @@ def estimate_capture(
     estimate = estimate_normals(
         capture, distilled or estimator, progress=progress or advance, clock=clock
     )
-    warnings += found
+    again = partial(estimate_normals, estimator=distilled or estimator, clock=clock)
+    estimate, of_tilt = undo_tilt(estimate, again, mends=work.options.mends_lights)
+    if of_tilt:
+        warnings = [warning for warning in warnings if warning.kind != LIGHTS_TILTED]
+    warnings += [*found, *of_tilt]
     warnings += [
         CaptureWarning(UNTRAINED_LIGHTS, text)
         for text in estimator.warn_of_lights(capture.n_lights)
@@ -205,6 +217,46 @@ def estimate_capture(
     refuse_if_strict(warnings, capture.name, strict=strict)
     estimate = replace(estimate, capture=replace(estimate.capture, warnings=tuple(warnings)))
     return estimate, distilled, work
+
+
+def undo_tilt(
+    estimate: NormalEstimate, again: Callable[[Capture], NormalEstimate], *, mends: bool
+) -> tuple[NormalEstimate, list[CaptureWarning]]:
+    """Return the estimate under lights that are tilted back if the normals of a network show that
+    all lights are tilted, and warnings.
+
+    The lights are changed only if this reduces the curl of the new normals, and only if `mends`.
+    """
+    capture = estimate.capture
+    others = tuple(each for each in capture.warnings if each.kind != LIGHTS_TILTED)
+    capture = replace(capture, warnings=others)
+    measured = capture.lamps is None and capture.camera_matrix is None
+    if estimate.confidence_map is None or not measured or capture.light_errors_deg is not None:
+        return estimate, []
+    tilt = find_tilt(estimate.normal_map, capture.mask)
+    if tilt is None or not tilt.is_clear:
+        return estimate, []
+    cause = f"The lights {tilt.cause}"
+    lights, left = capture.light_directions, tilt
+    for _ in range(_TILTS if mends else 0):
+        lights = lights @ left.matrix.T
+        if (lights[:, 2] <= 0).any():
+            break
+        mended = again(replace(capture, light_directions=lights))
+        found = find_tilt(mended.normal_map, capture.mask)
+        if found is None or found.curl > _LEAST_FALL * tilt.curl:
+            break
+        left = found
+        if left.degrees < _SMALL_TILT_DEG or left.left > _LEAST_FALL:
+            break
+    if left is not tilt:
+        text = f"{cause} They were corrected; --light-frame x-right,y-up keeps those of the file."
+        codes = (*capture.mended, LIGHTS_TILTED.code)
+        mended = replace(mended, capture=replace(mended.capture, mended=codes))
+        return mended, [CaptureWarning(LIGHTS_MENDED, text)]
+    warning = CaptureWarning(LIGHTS_TILTED, f"{cause} {TILT_ADVICE}.", tilt.degrees)
+    # the confidence accounts for it
+    return again(replace(capture, warnings=(*capture.warnings, warning))), [warning]
 
 
 def infer_capture(

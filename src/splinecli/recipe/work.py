@@ -37,6 +37,11 @@ class RecipeOptions:
     refine_lights: bool = False  # refine rough light directions
     light_error_deg: float | None = None  # the usual error of these; None for the default
 
+    @property
+    def mends_lights(self) -> bool:
+        """Whether clear faults of the lights are mended."""
+        return self.mends and not self.keeps_lights
+
 
 USUAL = RecipeOptions()
 
