@@ -4,7 +4,6 @@ from itertools import product
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from scenes import decode_rgb
 from splinecli.evaluation.figures import light_noise_curves, lights_curves
@@ -15,12 +14,12 @@ METHODS = ("ls", "spline-net")
 
 
 def evaluation_of(
-    captures: list[str],
-    n_lights: int | None = 10,
-    light_noise_deg: float = 0.0,
+    captures,
+    n_lights=10,
+    light_noise_deg=0.0,
     *,
-    all_lights: int = 96,
-) -> Evaluation:
+    all_lights=96,
+):
     level = 20 / (n_lights or all_lights) + light_noise_deg
     results = tuple(
         Result(
@@ -35,13 +34,13 @@ def evaluation_of(
     return Evaluation(Protocol(n_lights, 3, light_noise_deg=light_noise_deg), results)
 
 
-def share_of(colour: str, picture: NDArray[np.uint8]) -> float:
+def share_of(colour, picture):
     rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
     return float((np.abs(picture.astype(int) - rgb).max(axis=2) <= 2).mean())
 
 
 @pytest.mark.parametrize(
-    ("captures", "across", "down"),
+    "captures, across, down",
     [
         (["ball"], 1, 1),
         (["ball", "cat"], 3, 1),

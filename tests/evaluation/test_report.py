@@ -19,13 +19,11 @@ PNG = cv2.imencode(".png", np.zeros((30, 40, 3), np.uint8))[1].tobytes()
 WIDE_PNG = cv2.imencode(".png", np.zeros((30, 400, 3), np.uint8))[1].tobytes()
 
 
-def all_of(page: HtmlPage, tag: str) -> list[dict[str, str | None]]:
+def all_of(page, tag):
     return [attributes for name, attributes in page.tags if name == tag]
 
 
-def evaluation_of(
-    methods: list[str], captures: list[str], *, trials: int = 4, n_lights: int | None = 10
-) -> Evaluation:
+def evaluation_of(methods, captures, *, trials=4, n_lights=10):
     generator = np.random.default_rng(3)
     results = tuple(
         Result(

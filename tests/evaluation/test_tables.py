@@ -75,7 +75,7 @@ def test_rows_for_a_terminal():
 
 
 @pytest.mark.parametrize(
-    ("name", "shown"),
+    "name, shown",
     [
         ("a|b", r"a\|b"),
         ("![a](javascript:alert(1)) &lt; ~~b~~", r"!\[a\](javascript:alert(1)) \&lt; \~\~b\~\~"),
@@ -131,7 +131,7 @@ def test_latex_escapes_names():
     assert unescaped.count("{") == unescaped.count("}")
 
 
-def evaluation_of(**maes_deg: dict[str, tuple[float, ...]]) -> Evaluation:
+def evaluation_of(**maes_deg):
     """From {capture: {method: MAE of each trial}}."""
     pairs = ((capture, *item) for capture, methods in maes_deg.items() for item in methods.items())
     results = tuple(Result(method, capture, 10, maes, 1.0) for capture, method, maes in pairs)
@@ -194,7 +194,7 @@ def test_every_pair_on_every_capture_and_on_their_average():
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "interval", "p_value", "differs"),
+    "first, second, interval, p_value, differs",
     [
         ((4.0,), (5.0,), None, None, None),  # one trial
         ((4.0, 5.0, 6.0), (4.5, 5.5, 6.5), None, None, None),  # no spread

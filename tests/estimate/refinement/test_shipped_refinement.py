@@ -2,15 +2,12 @@
 everywhere.
 """
 
-from typing import Any
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from scenes import directions_at, halfway
 from splinecli.capture import Capture
-from splinecli.estimate.inference import NormalEstimate, estimate_normals
+from splinecli.estimate.inference import estimate_normals
 from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.estimate.refinement.refiner import MARGIN, TILE, NetworkRefiner
 from splinecli.lights.lighting import PixelLighting
@@ -27,13 +24,13 @@ PLATE = np.tile(unit(np.array((0.2, 0.1, 1.0))), (SIZE, SIZE, 1))
 
 
 def scene(
-    normals: NDArray[np.floating],
-    albedo: NDArray[np.floating] | float,
+    normals,
+    albedo,
     *,
-    noise: float,
-    gloss: float = 0.0,
-    unmeasured: NDArray[np.floating] | float = 1.0,
-) -> Capture:
+    noise,
+    gloss=0.0,
+    unmeasured=1.0,
+):
     """Return a scene of Lambert's cosine and a Phong highlight, with noise of a share of full
     scale.
 
@@ -58,12 +55,12 @@ def scene(
 
 
 @pytest.fixture(params=[False, True], ids=["as it is", "halved"], autouse=True)
-def halved(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def halved(request, monkeypatch):
     """Whether the net sees a scene at half the resolution, as the largest captures, or as it is."""
     monkeypatch.setattr(request.module, "HALVED", request.param)
 
 
-def refined_and_not(*surface: Any, **faults: Any) -> tuple[NormalEstimate, NormalEstimate]:
+def refined_and_not(*surface, **faults):
     """Estimate a scene with and without refinement; see `scene`."""
     capture = scene(*surface, **faults)
     estimator = make_estimator("spline-net")
@@ -73,11 +70,11 @@ def refined_and_not(*surface: Any, **faults: Any) -> tuple[NormalEstimate, Norma
     )
 
 
-def mean_error_deg(estimate: NormalEstimate) -> float:
+def mean_error_deg(estimate):
     return estimate.errors.mean
 
 
-@pytest.mark.parametrize(("noise", "most_tilted_deg"), [(0.01, 0.3), (0.03, 0.75)])
+@pytest.mark.parametrize("noise, most_tilted_deg", [(0.01, 0.3), (0.03, 0.75)])
 def test_a_noisy_plate_stays_as_flat_as_it_is(noise, most_tilted_deg):
     refined, pixelwise = refined_and_not(PLATE, 0.5, noise=noise)
     assert mean_error_deg(refined) < 1.05 * mean_error_deg(pixelwise)
@@ -102,26 +99,26 @@ def test_a_checker_of_albedo_leaves_no_more_trace_than_before(gloss):
     assert step_deg(refined) < step_deg(pixelwise) + 0.1
 
 
-def grooves(width: int) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+def grooves(width):
     """Normals of grooves `width` pixels to either side, and their slopes of 17 degrees."""
     slope = np.where((COLUMNS // width) % 2 == 1, 0.3, -0.3)
     return unit(np.stack((-slope, np.zeros_like(slope), np.ones_like(slope)), axis=-1)), slope
 
 
-def depth(estimate: NormalEstimate, slope: NDArray[np.floating]) -> float:
+def depth(estimate, slope):
     """The mean slope along the grooves' own, of which 1 is true."""
     found = -estimate.normal_map[..., 0] / estimate.normal_map[..., 2]
     return float(((found - found.mean()) / slope).mean())
 
 
-@pytest.mark.parametrize(("width", "gloss"), [(1, 0.0), (1, 0.5), (4, 0.5)])
+@pytest.mark.parametrize("width, gloss", [(1, 0.0), (1, 0.5), (4, 0.5)])
 def test_grooves_keep_their_depth(width, gloss):
     normals, slope = grooves(width)
     refined, pixelwise = refined_and_not(normals, 0.5, noise=0.002, gloss=gloss)
     assert depth(refined, slope) == pytest.approx(depth(pixelwise, slope), rel=0.1)
 
 
-@pytest.mark.parametrize(("width", "noise"), [(1, 0.02), (2, 0.002)])
+@pytest.mark.parametrize("width, noise", [(1, 0.02), (2, 0.002)])
 def test_wrong_light_intensities_do_not_blur_grooves(width, noise):
     """They turn normals by many degrees, which says nothing about detail. The net alone takes most
     of it for noise.

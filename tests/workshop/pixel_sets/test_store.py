@@ -2,7 +2,6 @@
 
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from splinecli.workshop.pixel_sets.store import (
 RECIPE = {"scenes": {"lights": 30}, "seed": 1}
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
+def read_manifest(folder):
     return read_json(folder / MANIFEST)
 
 
@@ -128,7 +127,7 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("manifest", "message"),
+    "manifest, message",
     [
         ({"name": "an app"}, "not the manifest of a pixel set: found format None"),
         (
@@ -169,7 +168,7 @@ def test_no_changed_byte_goes_unnoticed(make_set, array, entry):
         open_pixel_set(folder)
 
 
-DAMAGED: dict[str, Callable[[Path], object]] = {
+DAMAGED: dict[str, Any] = {
     "pipe": os.mkfifo,
     "folder": Path.mkdir,
     "link to nothing": lambda path: path.symlink_to("nothing"),
@@ -202,7 +201,7 @@ def test_a_damaged_array_is_named(make_set, array, damage):
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "message"),
+    "key, value, message",
     [
         (
             "n_pixels",
@@ -243,7 +242,7 @@ def test_a_changed_manifest(make_set, key, value, message):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text, message",
     [
         ("{", "not JSON"),
         (
