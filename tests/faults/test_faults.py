@@ -13,6 +13,7 @@ import pytest
 
 from kills import content
 from scenes import write_capture, write_image
+from splinecli.cli.main import main
 from splinecli.errors import InputError
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.maths.normals import unit
@@ -35,12 +36,13 @@ def shell(script, folder):
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, monkeypatch):
     """A folder with a flat capture of 60 x 60 pixels and the results of an earlier run in `out`."""
     noise = np.random.default_rng(0).integers(0, 2000, (len(LIGHTS), 60, 60))
     images = (50_000 * LIGHTS[:, 2, None, None] + noise).astype(np.uint16)
     write_capture(tmp_path / "a", images, LIGHTS, names="{}.png")
-    assert shell(f"{COMMAND} infer a --method ls -q", tmp_path).returncode == 0
+    monkeypatch.chdir(tmp_path)
+    assert main(["infer", "a", "--method", "ls", "-q"]) == 0
     return tmp_path
 
 

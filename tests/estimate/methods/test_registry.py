@@ -109,6 +109,7 @@ def test_what_changes_nothing(name, change, glossy_pixels):
     rotations go.
     """
     _, lights, observations = glossy_pixels
+    observations = observations[: 12 if name == "cnn-ps" else 60]  # which takes ten times as long
     order, turn = np.arange(len(lights)), np.eye(3)
     if change == "order of lights":
         order = np.random.default_rng(0).permutation(len(lights))

@@ -252,14 +252,14 @@ def deflated(path):
 def countless_records(path):
     torch.save({"a": torch.zeros(3)}, path)
     with zipfile.ZipFile(path, "a") as archive:
-        for number in range(20_000):
+        for number in range(10_500):
             archive.writestr(f"archive/extra/{number}", b"")
 
 
 def countless_tensors(path, new=True):
     empty = torch.zeros(0)
     torch.save(
-        {str(number): empty[:0] for number in range(25_000)},
+        {str(number): empty[:0] for number in range(16_000)},
         path,
         _use_new_zipfile_serialization=new,
     )

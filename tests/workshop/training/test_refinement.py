@@ -157,7 +157,7 @@ def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(refining, t
 
 @pytest.mark.usefixtures("no_pictures")
 def test_a_second_refinement_net_follows_one_that_is_trained(refining, tmp_path):
-    Trainer(refining, tmp_path / "first", CPU).run()
+    Trainer(replace(refining, steps=5), tmp_path / "first", CPU).run()
     start_from = str(tmp_path / "first" / WEIGHTS)
     twice = replace(
         refining,
