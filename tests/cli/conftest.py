@@ -98,6 +98,11 @@ class Run(NamedTuple):
         return json.loads(self.out)
 
 
+def table(text: str) -> list[tuple[str, ...]]:
+    """The cells of a table whose lines have | between them."""
+    return [tuple(map(str.strip, line.split("|"))) for line in text.strip().splitlines()]
+
+
 COMMAND = cache(typer.main.get_command)
 """The commands are the same in all tests. Making them takes longer than many a command."""
 

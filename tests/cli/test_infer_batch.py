@@ -14,7 +14,7 @@ from urllib.parse import unquote
 import pytest
 
 from capture.test_cyclesps import write_object
-from cli.conftest import read_report
+from cli.conftest import read_report, table
 from splinecli.errors import InputError, UsageError
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.pipeline.batch import infer_batch, list_captures, worst_exit_code
@@ -112,43 +112,27 @@ def test_a_folder_that_is_given_twice_counts_once(capture, run):
     assert not Path("out/index.html").exists()
 
 
-@pytest.mark.parametrize(
-    "arguments, code, message",
-    [
-        (
-            "--maps albedo confidence",
-            2,
-            "confidence: the folder does not exist. Write lists with commas",
-        ),
-        ("--lights none.txt", 3, "none.txt: the file does not exist."),
-        ("--mask none.png", 3, "none.png: the file does not exist."),
-        ("--flat-field none", 3, "none: the folder does not exist."),
-        ("--maps albedo,depth", 2, "--maps has 'depth'"),
-        (
-            "--transfer rec709",
-            2,
-            "'rec709'; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10",
-        ),
-        ("--white-level 0", 2, "--white-level is '0'; expected a number above 0"),
-        ("--weights spline-net", 2, "method ls uses no weights"),
-        ("--maps confidence", 2, "method ls does not provide confidence"),
-        ("--update --overwrite", 2, "--overwrite and --update contradict each other"),
-        ("--workers 0", 2, "--workers is '0'; expected a number of at least 1, or auto"),
-        ("--workers many", 2, "--workers is 'many'; expected a number of at least 1, or auto"),
-        (
-            "--workers 2 --cluster tcp://a:1",
-            2,
-            "--workers and --cluster contradict each other",
-        ),
-        ("--shard 3/2", 2, "--shard is 3/2; expected I/N with I from 1 to N"),
-        ("--shard half", 2, "--shard is 'half'; expected I/N"),
-        (
-            "--cluster none.json",
-            2,
-            "--cluster is none.json; expected an address such as tcp://scheduler:8786",
-        ),
-    ],
-)
+REFUSED_ARGUMENTS = """
+--maps albedo confidence | 2 | confidence: the folder does not exist. Write lists with commas
+--lights none.txt | 3 | none.txt: the file does not exist.
+--mask none.png | 3 | none.png: the file does not exist.
+--flat-field none | 3 | none: the folder does not exist.
+--maps albedo,depth | 2 | --maps has 'depth'
+--transfer rec709 | 2 | 'rec709'; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10
+--white-level 0 | 2 | --white-level is '0'; expected a number above 0
+--weights spline-net | 2 | method ls uses no weights
+--maps confidence | 2 | method ls does not provide confidence
+--update --overwrite | 2 | --overwrite and --update contradict each other
+--workers 0 | 2 | --workers is '0'; expected a number of at least 1, or auto
+--workers many | 2 | --workers is 'many'; expected a number of at least 1, or auto
+--workers 2 --cluster tcp://a:1 | 2 | --workers and --cluster contradict each other
+--shard 3/2 | 2 | --shard is 3/2; expected I/N with I from 1 to N
+--shard half | 2 | --shard is 'half'; expected I/N
+--cluster none.json | 2 | --cluster is none.json; expected an address such as tcp://scheduler:8786
+"""
+
+
+@pytest.mark.parametrize("arguments, code, message", table(REFUSED_ARGUMENTS))
 def test_arguments_are_checked_before_the_first_capture(
     arguments, code, message, capture, make_capture, run, monkeypatch
 ):
@@ -160,6 +144,7 @@ def test_arguments_are_checked_before_the_first_capture(
         "splinecli.pipeline.batch.infer_capture", lambda *_, **__: touched.append(1)
     )
     call = f"infer {capture} second --method ls {arguments}"
+    code = int(code)
     result = run(call, code=code, says=message)
     assert (result.out, touched, result.err.count("\n")) == ("", [], 1)
     assert not Path("out").exists()

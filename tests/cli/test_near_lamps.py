@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cli.conftest import table
 from cli.test_schema import check
 from scenes import BUMP_LAMPS, BUMP_MM, codes, read_image, write_bump, write_image
 from splinecli.maths.normals import unit
@@ -87,25 +88,25 @@ def test_distant_lights_despite_positions_are_warned_of(infer, near):
     assert warning["code"] == "few_lights"
 
 
-REFUSED = [
-    ("--light-distance 170", 2, "--light-distance needs the size of a pixel"),
-    ("--light-distance 170 --light-positions l.txt", 2, "contradict each other"),
-    ("--pixel-size 1 --object-width 2 --light-distance 3", 2, "contradict each other"),
-    ("--pixel-size -1", 2, "--pixel-size is '-1'; expected a number above 0"),
-    ("--surface --pixel-size 1e9", 2, "the pixel size is 1e+09 mm, expected"),
-    ("--pixel-size 1", 2, "--pixel-size concerns near lamps, and bump has no light_positions.txt"),
-    ("--light-positions l.txt --lights l.txt", 2, "contradict each other"),
-    ("--light-positions missing.txt", 3, "missing.txt: the file does not exist"),
-    ("--light-positions l.txt", 3, "the scale of the lamp positions is unknown"),
-    ("--light-positions l.txt --pixel-size 1 --light-format azel", 2, "concerns light directions"),
-]
+REFUSED = """
+--light-distance 170 | 2 | --light-distance needs the size of a pixel
+--light-distance 170 --light-positions l.txt | 2 | contradict each other
+--pixel-size 1 --object-width 2 --light-distance 3 | 2 | contradict each other
+--pixel-size -1 | 2 | --pixel-size is '-1'; expected a number above 0
+--surface --pixel-size 1e9 | 2 | the pixel size is 1e+09 mm, expected
+--pixel-size 1 | 2 | --pixel-size concerns near lamps, and bump has no light_positions.txt
+--light-positions l.txt --lights l.txt | 2 | contradict each other
+--light-positions missing.txt | 3 | missing.txt: the file does not exist
+--light-positions l.txt | 3 | the scale of the lamp positions is unknown
+--light-positions l.txt --pixel-size 1 --light-format azel | 2 | concerns light directions
+"""
 
 
-@pytest.mark.parametrize("arguments, code, message", REFUSED)
+@pytest.mark.parametrize("arguments, code, message", table(REFUSED))
 def test_refused_options(run, bump, arguments, code, message):
     np.savetxt(bump / "light_directions.txt", BUMP_LAMPS)
     np.savetxt("l.txt", BUMP_LAMPS)
-    run(f"infer bump --method ls {arguments}", code=code, says=message)
+    run(f"infer bump --method ls {arguments}", code=int(code), says=message)
 
 
 def test_wrong_files_are_named(run, near):

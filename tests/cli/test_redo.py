@@ -11,7 +11,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from cli.conftest import read_report
+from cli.conftest import read_report, table
 from scenes import read_json
 from splinecli.pipeline.batch import infer_batch
 from splinecli.pipeline.infer_options import InferOptions
@@ -270,18 +270,18 @@ def test_an_interruption_of_a_capture_ends_it(run, capture, monkeypatch):
     run("watch parts --settle 0 -- --method ls", code=130, says="interrupted")
 
 
-@pytest.mark.parametrize(
-    "options, problem",
-    [
-        ("--json", "--json prints one list at the end, and watch has none"),
-        ("--shard 1/2", "--shard splits a list of captures"),
-        ("other", "found other after the dashes, expected options of infer"),
-        ("-o sphere/../sphere", "the results would be among the captures"),
-        ("--methd ls", "no option --methd"),
-        ("--method lss", "no method named 'lss'"),
-        ("--overwrite --update", "contradict each other"),
-    ],
-)
+REFUSED_OPTIONS = """
+--json | --json prints one list at the end, and watch has none
+--shard 1/2 | --shard splits a list of captures
+other | found other after the dashes, expected options of infer
+-o sphere/../sphere | the results would be among the captures
+--methd ls | no option --methd
+--method lss | no method named 'lss'
+--overwrite --update | contradict each other
+"""
+
+
+@pytest.mark.parametrize("options, problem", table(REFUSED_OPTIONS))
 def test_wrong_options_are_refused(run, capture, options, problem):
     run(f"watch {capture} --settle 0 -- {options}", code=2, says=problem)
 
