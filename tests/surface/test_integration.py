@@ -21,14 +21,18 @@ COARSE_FROM = {"own scale": 10**9, "coarse to fine": 300}
 
 
 @pytest.fixture
-def until_nothing_moves(monkeypatch):
+def no_movement(monkeypatch):
     monkeypatch.setattr(integration, "STILL", 0.0)
     monkeypatch.setattr(integration, "SOLVES_OF_COARSEST", 400)
 
 
 @pytest.fixture(params=COARSE_FROM)
-def any_scale(request, monkeypatch):
+def scale(request, monkeypatch):
     monkeypatch.setattr(integration, "COARSEST", COARSE_FROM[request.param])
+
+
+until_nothing_moves = pytest.mark.usefixtures("no_movement")
+any_scale = pytest.mark.usefixtures("scale")
 
 
 def grid(height, width):
@@ -82,7 +86,7 @@ def error_share(found, truth, mask):
     return float(np.abs(error - np.median(error)).mean() / np.ptp(truth[mask]))
 
 
-@pytest.mark.usefixtures("any_scale")
+@any_scale
 @pytest.mark.parametrize("discontinuity", [0, 2])
 @pytest.mark.parametrize("reach, limit", [(0.6, 1e-4), (0.9, 2e-4), (1.0, 1e-3)])
 def test_sphere(reach, limit, discontinuity):
@@ -149,7 +153,7 @@ def seen(camera, height, width):
     return np.stack((x, -down, -np.ones_like(x)), axis=-1)
 
 
-@pytest.mark.usefixtures("any_scale")
+@any_scale
 def test_perspective_plane():
     rays, mask = seen(CAMERA, 90, 120), np.ones((90, 120), bool)
     normal = unit(np.array([0.3, -0.4, 0.8]))
@@ -166,7 +170,7 @@ def test_perspective_plane():
     )
 
 
-@pytest.mark.usefixtures("any_scale")
+@any_scale
 def test_perspective_sphere():
     rays = seen(CAMERA, 90, 120)
     centre, radius = np.array([0.1, -0.05, -6.0]), 1.1
@@ -271,7 +275,7 @@ def drifting(seed=0):
 
 
 @pytest.mark.parametrize("discontinuity", [0.0, 2.0])
-@pytest.mark.usefixtures("any_scale")
+@any_scale
 def test_a_prior_is_better_than_normals_and_scan_alone(discontinuity):
     normals, heights, scan = drifting()
     scan[80:95, 60:120] = np.nan
@@ -297,7 +301,7 @@ def test_a_prior_in_another_direction_or_unit():
         assert stated and float(stated[1]) == pytest.approx(factor, rel=0.2)
 
 
-@pytest.mark.usefixtures("until_nothing_moves")
+@until_nothing_moves
 def test_bilateral_is_the_dense_solution():
     normals, mask = bumps(12, 17, usable=True), holes(12, 17)
     found = integrate_normals(normals, mask)[mask]
@@ -307,7 +311,7 @@ def test_bilateral_is_the_dense_solution():
     assert_allclose(found, expected, atol=5e-3)
 
 
-@pytest.mark.usefixtures("any_scale")
+@any_scale
 @pytest.mark.parametrize("camera", [None, CAMERA])
 def test_single_pixels_and_normals_that_are_not_usable(camera):
     normals, mask = bumps(12, 17), holes(12, 17)
@@ -323,7 +327,7 @@ def test_single_pixels_and_normals_that_are_not_usable(camera):
     assert_allclose(found[mask], middle, atol=1e-9)
 
 
-@pytest.mark.usefixtures("any_scale")
+@any_scale
 def test_backward_normals_are_bridged():
     normals, mask, truth = sphere(60, 80, 40, 0.8)
     wrong = np.random.default_rng(3).uniform(size=mask.shape) < 0.05
@@ -332,7 +336,7 @@ def test_backward_normals_are_bridged():
     assert error_share(found, truth, mask) < 5e-3
 
 
-@pytest.mark.usefixtures("until_nothing_moves")
+@until_nothing_moves
 def test_turning_the_picture_turns_the_surface():
     normals, mask = bumps(18, 25, 4), holes(18, 25, 5)
     x, y, z = np.moveaxis(normals, -1, 0)

@@ -112,13 +112,15 @@ def test_truncated_and_damaged_images(tmp_path, write_image, capfd, name):
         write_image(name, large)  # OpenCV's TIFF is LZW
     data = path.read_bytes()
     contents = [data[: int(len(data) * share)] for share in (0.05, 0.5, 0.95, 0.999)]
+    if name == "a.tif":
+        contents += [data[:size] for size in (0, 8, 9, 60, 100, 200, 1000, -10)]
     if name in ("a.png", "deflate.tif"):  # others have no checksums
         contents.append(data[: len(data) // 2] + bytes(30) + data[len(data) // 2 + 30 :])
     for content in contents:
         path.write_bytes(content)
         message = (
             r"is (truncated|damaged (and cannot be read|\(a checksum is wrong\)))\. Copy or export "
-            r"it again\."
+            r"it again\.|the file is empty"
         )
         with pytest.raises(InputError, match=message) as caught:
             read_image(path)

@@ -210,13 +210,12 @@ def inverse(matrices, smallest, library):
     return result
 
 
-@pytest.mark.parametrize("library", ["numpy", "torch"])
-def test_inverse(library):
+def test_inverse():
     matrices = positive_matrices(1000)
     expected = np.linalg.inv(matrices)
     size = np.abs(expected).max(axis=(1, 2), keepdims=True)
     # The worst of a thousand such matrices has a condition number of about 1e7.
-    assert_allclose(inverse(matrices, 1e-14, library) / size, expected / size, atol=1e-8)
+    assert_allclose(inverse(matrices, 1e-14, "numpy") / size, expected / size, atol=1e-8)
 
 
 def test_numpy_and_torch_agree_to_the_last_bit():
