@@ -66,8 +66,7 @@ def test_the_same_warnings_as_infer(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "dtype, scale",
-    [(np.float32, 3.0), (np.float64, 1e-3), (np.uint16, 50_000), (np.uint8, 200)],
+    "dtype, scale", [(np.float32, 3.0), (np.float64, 1e-3), (np.uint16, 50_000), (np.uint8, 200)]
 )
 def test_matte_images_of_each_type(dtype, scale):
     images, normals = matte(dtype, scale)
@@ -136,11 +135,7 @@ def test_saturated_values_are_restored_unless_as_stored():
     ],
 )
 def test_wrong_arguments(change, error, message):
-    arguments = {
-        "images": np.ones((4, 5, 6)),
-        "light_directions": FOUR_LIGHTS,
-        "method": "ls",
-    }
+    arguments = {"images": np.ones((4, 5, 6)), "light_directions": FOUR_LIGHTS, "method": "ls"}
     with pytest.raises(error) as caught:
         splinecli.estimate_normals(**(arguments | change))
     assert message in str(caught.value)

@@ -17,12 +17,7 @@ from PIL import Image
 
 import scenes
 from scenes import codes, to_uint16, write_image
-from splinecli.capture import (
-    CaptureOptions,
-    Overrides,
-    find_capture_files,
-    open_capture,
-)
+from splinecli.capture import CaptureOptions, Overrides, find_capture_files, open_capture
 from splinecli.capture.formats.images import decode_image
 from splinecli.capture.light_files import read_light_positions
 from splinecli.errors import InputError, UsageError
@@ -255,8 +250,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(
-    "name, text, message",
-    [(name, *case) for name, cases in REFUSED.items() for case in cases],
+    "name, text, message", [(name, *case) for name, cases in REFUSED.items() for case in cases]
 )
 def test_refused_light_files(folder, name, text, message):
     (folder / "light_directions.txt").unlink()

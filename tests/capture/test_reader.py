@@ -175,11 +175,7 @@ MASK = np.array([[True, False, True], [True, True, False]])
 
 
 def make(**changes):
-    fields = {
-        "name": "vase",
-        "observations": np.arange(16).reshape(4, 4),
-        "mask": MASK,
-    }
+    fields = {"name": "vase", "observations": np.arange(16).reshape(4, 4), "mask": MASK}
     return Capture(
         **(fields | {"light_directions": FOUR_LIGHTS, "light_indices": (0, 1, 2, 7)} | changes)
     )

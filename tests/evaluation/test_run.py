@@ -174,12 +174,7 @@ def test_progress(write_dome):
     folders = [write_dome("a"), write_dome("b")]
     seen = []
     protocols = [Protocol(n_lights=7, trials=2), Protocol()]
-    evaluate_all(
-        folders,
-        LS,
-        protocols,
-        on_progress=lambda share, note: seen.append((share, note)),
-    )
+    evaluate_all(folders, LS, protocols, on_progress=lambda share, note: seen.append((share, note)))
     shares, notes = zip(*seen, strict=True)
     assert min(shares) == 0
     assert sum(shares) == pytest.approx(1)

@@ -12,15 +12,7 @@ import tifffile
 from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
-from scenes import (
-    codes,
-    shade,
-    sphere_cap,
-    spiral_lights,
-    to_uint16,
-    with_chunk,
-    write_capture,
-)
+from scenes import codes, shade, sphere_cap, spiral_lights, to_uint16, with_chunk, write_capture
 from splinecli.capture.formats.images import decode_image, to_linear
 from splinecli.capture.reader import CaptureOptions, open_capture
 from splinecli.errors import InputError

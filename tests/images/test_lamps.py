@@ -26,9 +26,7 @@ SOFT = np.tile(
 PURE = np.tile([(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1), (1, 1, 0)], (2, 1)).astype(float)
 
 
-def striped(
-    colours,
-):
+def striped(colours):
     """Return 16-bit images (F, H, W, 3) of a ball with stripes, its normals (H, W,
     3) and its mask.
     """

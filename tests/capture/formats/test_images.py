@@ -144,8 +144,7 @@ NOT_FINITE = "a value that is not finite"
 
 
 @pytest.mark.parametrize(
-    "value, found",
-    [(np.nan, NOT_FINITE), (np.inf, NOT_FINITE), (-0.5, "the negative value -0.5")],
+    "value, found", [(np.nan, NOT_FINITE), (np.inf, NOT_FINITE), (-0.5, "the negative value -0.5")]
 )
 def test_values_no_photograph_has(tmp_path, value, found):
     path = tmp_path / "a.tif"

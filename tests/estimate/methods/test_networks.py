@@ -68,8 +68,7 @@ QUARTER, MIRROR = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.diag((1.0, 
 
 
 @pytest.mark.parametrize(
-    "settings, turn, symmetric_from",
-    [(PAPER, QUARTER, 4), ({}, MIRROR, 2), (SEES, MIRROR, 2)],
+    "settings, turn, symmetric_from", [(PAPER, QUARTER, 4), ({}, MIRROR, 2), (SEES, MIRROR, 2)]
 )
 def test_rotations_make_a_network_symmetric(settings, turn, symmetric_from):
     """Four make the paper's fourfold symmetric, for turned lights only change their order; two make
@@ -248,11 +247,7 @@ def mean_errors(folder, methods, protocol):
     return {result.method: result.mae_deg for result in results}
 
 
-def check(
-    errors,
-    table,
-    place,
-):
+def check(errors, table, place):
     ours = {method: own[place] for method, (own, _) in table.items()}
     assert errors == pytest.approx(ours, abs=REPEATED_DEG)
     for method, (_, published) in table.items():

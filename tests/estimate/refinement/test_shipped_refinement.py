@@ -22,14 +22,7 @@ ROWS, COLUMNS = np.mgrid[:SIZE, :SIZE]
 PLATE = np.tile(unit(np.array((0.2, 0.1, 1.0))), (SIZE, SIZE, 1))
 
 
-def scene(
-    normals,
-    albedo,
-    *,
-    noise,
-    gloss=0.0,
-    unmeasured=1.0,
-):
+def scene(normals, albedo, *, noise, gloss=0.0, unmeasured=1.0):
     """Return a scene of Lambert's cosine and a Phong highlight, with noise of a share of full
     scale.
 

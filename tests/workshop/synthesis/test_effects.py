@@ -78,8 +78,7 @@ def mirror(pixels):
 def test_matte_walls_reflect_by_the_cosine_law_twice():
     normals = draw_visible_normals(50, seeded(1))
     wall = replace(
-        draw_wall(normals, 1.0, seeded()),
-        has_pixel_material=torch.zeros(50, 1, dtype=torch.bool),
+        draw_wall(normals, 1.0, seeded()), has_pixel_material=torch.zeros(50, 1, dtype=torch.bool)
     )
     directions, inside = cell_directions()
     cosine = dot(wall.facing, directions[inside]).clamp(min=0)

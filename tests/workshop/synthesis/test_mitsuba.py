@@ -20,11 +20,7 @@ from splinecli.workshop.synthesis.meshes import (
     torus,
     triangulate,
 )
-from splinecli.workshop.synthesis.scenes import (
-    SceneConfig,
-    draw_scene,
-    render_scene,
-)
+from splinecli.workshop.synthesis.scenes import SceneConfig, draw_scene, render_scene
 
 pytest.importorskip("embreex", reason="needs the extra 'render'")
 mitsuba = pytest.importorskip("mitsuba", reason="Mitsuba is the oracle")

@@ -95,12 +95,7 @@ def test_round_pieces_turn_away_at_their_rim():
 SHARP = torch.ones(3, 1, 1)
 
 
-def camera(
-    kernels=SHARP,
-    demosaic=None,
-    sharpening=0.0,
-    quality=None,
-):
+def camera(kernels=SHARP, demosaic=None, sharpening=0.0, quality=None):
     return Optics(kernels, (0.25, 0.5, 0.25), demosaic, sharpening, 1.0, quality)
 
 
