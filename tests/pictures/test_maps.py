@@ -252,7 +252,7 @@ CELL_YELLOW, CELL_VIOLET, GRAY = ((253, 231, 36), (68, 1, 84), (217, 217, 217))
 
 
 @cache
-def draw_cells(n_pixels, *, with_truth=True, with_dense=True, named=True, grid="even"):
+def draw_cells(n_pixels, *, with_truth=True, with_dense=True, named=True):
     """RGB (H, W, 3). Sparse maps have a one at row 1, column 5; dense maps are zeros; the truth is
     empty.
     """
@@ -265,7 +265,7 @@ def draw_cells(n_pixels, *, with_truth=True, with_dense=True, named=True, grid="
         pixels=np.array([[12, 34]] * n_pixels) if named else None,
         error_deg=np.full(n_pixels, 3.25),
         title="$cat$, 10 lights" if named else "",
-        grid=grid,
+        grid="even",
     )
     return decode_rgb(png)
 

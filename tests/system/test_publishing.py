@@ -15,7 +15,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from kills import content, killed_at, missing_syncs, record_calls
+from kills import content, killed_at_every_step, missing_syncs, record_calls
 from splinecli.errors import OutputError
 from splinecli.system import files
 from splinecli.system.files import UNFINISHED, parse_json, write_bytes, write_text
@@ -52,13 +52,8 @@ FULL = OSError(errno.ENOSPC, "No space left on device")
 
 @pytest.mark.parametrize("first", [True, False])
 def test_a_folder_with_a_report_is_whole_after_a_kill_at_any_step(tmp_path, first):
-    reports, step = [], 0
-    while True:
-        folder = tmp_path / str(step)
-        old = MINE if first else OLD | MINE
-        write(folder, old)
-        if not killed_at(step, lambda folder=folder: publish(folder)):
-            break
+    reports, old = [], MINE if first else OLD | MINE
+    for folder in killed_at_every_step(tmp_path, lambda folder: write(folder, old), publish):
         found = []
         left = content(folder)
         with held_folder(folder, found.append):
@@ -67,12 +62,11 @@ def test_a_folder_with_a_report_is_whole_after_a_kill_at_any_step(tmp_path, firs
         assert (found == [f"{folder}: {UNDONE}"]) == any(name.endswith(UNFINISHED) for name in left)
         reports.append(after.get(REPORT))
         if REPORT in after:
-            assert after in (old, NEW | MINE), step
+            assert after in (old, NEW | MINE)
         else:  # files of one run only
             assert after.items() <= (OLD | MINE).items() or after.items() <= (NEW | MINE).items()
         publish(folder)
         assert content(folder) == NEW | MINE
-        step += 1
     # The earlier report, then none, then the new one, whose place in the folder is all that is left
     # to sync.
     assert reports == sorted(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kills import content, killed_at
+from kills import content, killed_at_every_step
 from scenes import read_json
 from small_pixel_sets import matte_pixels
 from splinecli.errors import InputError, OutputError
@@ -84,19 +84,17 @@ def test_recipes_are_compared(tmp_path):
 
 
 def test_a_replacement_killed_at_any_step_leaves_the_old_set_or_an_unfinished_one(tmp_path):
-    old, new, kept, step = matte_pixels(7, 5), matte_pixels(9, 4), [], 0
-    while True:
-        folder = tmp_path / str(step)
-        folder.mkdir()
+    old, new, kept = matte_pixels(7, 5), matte_pixels(9, 4), []
+
+    def make(folder):
         writer = PixelSetWriter(folder)
         writer.add("a", "a", "a test", RECIPE, old)
         writer.finish()
 
-        def replace(folder=folder):
-            PixelSetWriter(folder).add("a", "a", "a test", {"seed": 2}, new)
+    def replace(folder):
+        PixelSetWriter(folder).add("a", "a", "a test", {"seed": 2}, new)
 
-        if not killed_at(step, replace):
-            break
+    for folder in killed_at_every_step(tmp_path, make, replace):
         with held_folder(folder):
             again = PixelSetWriter(folder)
         kept.append(again.recipe_of("a") if "a" in again else None)
@@ -106,15 +104,12 @@ def test_a_replacement_killed_at_any_step_leaves_the_old_set_or_an_unfinished_on
             with pytest.raises(InputError, match="not finished"):
                 open_pixel_set(folder)
             if kept[-1] is None:  # while its files changed, the set did not have the entry
-                replace()
+                replace(folder)
                 again = PixelSetWriter(folder)
             (entry,) = again.finish().entries
             assert (entry.n_pixels, entry.recipe) == (9, {"seed": 2})
             assert open_pixel_set(folder).entries == (entry,)
-        step += 1
-    assert RECIPE in kept
-    assert None in kept
-    assert {"seed": 2} in kept
+    assert all(recipe in kept for recipe in (RECIPE, None, {"seed": 2}))
 
 
 def test_a_folder_with_other_files_is_left_alone(tmp_path):
