@@ -73,7 +73,13 @@ def alarm():
 
 @pytest.fixture
 def inputs(capture, monkeypatch):
-    """What the commands read. Figures are not drawn: these tests are about their files."""
+    """What the commands read: five images, for speed. Figures are not drawn: these tests are about
+    their files.
+    """
+    for number in (6, 7, 8):
+        (capture / f"image{number}.png").unlink()
+    lights = capture / "light_directions.txt"
+    lights.write_text("".join(lights.read_text().splitlines(keepends=True)[:5]))
     drawn = cv2.imencode(".png", np.zeros((3, 4, 3), np.uint8))[1].tobytes()
     monkeypatch.setattr("splinecli.evaluation.figures.method_maps", lambda *_, **__: drawn)
     np.save("n.npy", np.tile(np.float32([0, 0, 1]), (8, 9, 1)))
