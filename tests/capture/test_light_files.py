@@ -196,9 +196,8 @@ def test_wrong_intensities(tmp_path, text, message):
 def test_one_light_in_each_column_is_no_count(tmp_path, n_images):
     # The first column, 1 3 2, would count three lights.
     path = put(tmp_path / "lights.txt", "1 0 0 1\n3 1 0 0\n2 1 1 1")
-    expected = np.array([[1, 3, 2], [0, 1, 1], [0, 0, 1], [1, 0, 1]])
-    expected = unit(expected)
-    assert_allclose(read_light_directions(path, n_images), expected)
+    expected = np.array([[1.0, 3, 2], [0, 1, 1], [0, 0, 1], [1, 0, 1]])
+    assert_allclose(read_light_directions(path, n_images), unit(expected))
 
 
 @pytest.mark.parametrize(

@@ -255,8 +255,7 @@ def test_tiff_of_12_bits_a_sample(tmp_path):
     assert np.count_nonzero(capture.restored) <= np.count_nonzero(images == 4095)
 
 
-GRID_LIGHTS = np.array([(x, y, 1.4) for x in (-1, 0, 1) for y in (-1, 0, 1)], dtype=float)
-GRID_LIGHTS = unit(GRID_LIGHTS)
+GRID_LIGHTS = unit(np.array([(x, y, 1.4) for x in (-1, 0, 1) for y in (-1, 0, 1)], dtype=float))
 
 
 def matte(pixels):

@@ -47,8 +47,7 @@ def ggx_sphere(lights, *, diffuse, f0, roughness):
     without Fresnel.
     """
     alpha = roughness**2
-    half = lights + np.array((0, 0, 1.0))
-    half = unit(half)
+    half = unit(lights + np.array((0, 0, 1.0)))
     n_l, n_h, n_v = (NORMALS @ lights.T).clip(0), (NORMALS @ half.T).clip(0), NORMALS[:, 2:]
     facets = alpha**2 / (np.pi * (n_h**2 * (alpha**2 - 1) + 1) ** 2)
 

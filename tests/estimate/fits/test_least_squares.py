@@ -79,8 +79,7 @@ def test_iw12_fixed_point(matte_pixels):
 
 def test_l1_is_the_linear_programme_s_optimum():
     rng = np.random.default_rng(0)
-    lights = rng.normal(size=(10, 3)) * (0.4, 0.4, 0.1) + (0, 0, 1)
-    lights = unit(lights)
+    lights = unit(rng.normal(size=(10, 3)) * (0.4, 0.4, 0.1) + (0, 0, 1))
     observations = rng.uniform(size=(30, 10))
     found = solve_l1(torch.tensor(observations), torch.tensor(lights)).numpy()
     excess = []

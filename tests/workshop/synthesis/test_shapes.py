@@ -162,8 +162,7 @@ def test_a_plate_gets_the_normals_of_the_height():
     places[:, 2] = 0
     up = np.tile(np.float32((0, 0, 1)), (500, 1))
     slope = 0.6 * np.cos(2 * np.pi * (places[:, 0] + places[:, 1]) / 0.5)
-    expected = np.stack((-slope, -slope, np.ones(500)), axis=1)
-    expected = unit(expected)
+    expected = unit(np.stack((-slope, -slope, np.ones(500)), axis=1))
     off = np.degrees(np.arccos(np.clip((relief.bend(up, places) * expected).sum(axis=1), -1, 1)))
     assert off.max() < 4.5  # half a texel of 64 along both axes
 

@@ -108,8 +108,7 @@ def bumpy_set(tmp_path):
         lights = rng.normal((0, 0, 2), 1, (9, 3))
         lights[:, 2] = np.abs(lights[:, 2]) + 0.5
         lights = unit(lights).astype(np.float32)
-        normals = np.tile(np.float32((0.28 * index, 0, 0.96)), (196, 1))
-        normals = unit(normals)
+        normals = unit(np.tile(np.float32((0.28 * index, 0, 0.96)), (196, 1)))
         observations = (normals @ lights.T).clip(0) * rng.uniform(0.5, 1.5, (196, 9))
         mask = np.ones((14, 14), np.bool_)
         writer.add(
