@@ -41,7 +41,7 @@ from splinecli.workshop.synthesis.scenes import (
 
 Array = NDArray[np.float64]
 SHAPES = ("", "", "relief", "", "", "plane", "", "", "sphere", "", "", "low relief")
-ANALYTIC = ("ideal", "rough", TRANSLUCENT)  # materials that are not rendered
+ANALYTIC = ("ideal", "rough", "retro", TRANSLUCENT)  # materials that are not rendered
 MATERIALS_PER_SCENE, FAULTS_PER_CAPTURE = 4, 7
 PRIOR = {RIGHT: 0.9, TRANSLUCENT: 0.03}  # the other classes share the rest
 COLUMNS = ("features", "classes", "scenes", "materials")
@@ -153,7 +153,7 @@ def render(seed: int, index: int) -> Iterator[Rendered]:
 
 def shading(name: str, strength: float, cosines: Array, light_z: Array, normal_z: Array) -> Array:
     """Return the shading (P, F) of a material without cast shadows, under lights with the given z:
-    exactly matte; rough, after Oren and Nayar (1994); or translucent, so that light which enters
+    exactly matte; retroreflecting; rough, after Oren and Nayar (1994); or translucent, so that light which enters
     comes out beyond the terminator.
     """
     if name == TRANSLUCENT:
@@ -161,6 +161,9 @@ def shading(name: str, strength: float, cosines: Array, light_z: Array, normal_z
     lit = cosines.clip(0)
     if name == "ideal":
         return lit
+    if name == "retro":  # fabric that reflects towards the light, and at grazing angles
+        grazing = (1 - np.sqrt((1 + light_z.clip(-1)) / 2)) ** 2
+        return np.asarray(lit * (1 + 2 * strength * light_z.clip(0) ** 4 + 8 * strength * grazing))
     squared = 2 * strength**2
     along = light_z - cosines * normal_z
     along = np.where(along > 0, along / np.maximum(np.maximum(lit, normal_z), 0.05), along)

@@ -6,14 +6,12 @@ from __future__ import annotations
 
 import shutil
 import warnings
-from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Page
 
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 """Names of the system's Chromium on the path."""
@@ -36,9 +34,6 @@ HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
 };
 """
 
-OpenPage = Callable[..., "Page"]
-"""Signature: open_page(html, fragment="", *, width=800, height=600, webgl=True)."""
-
 
 def find_chromium() -> str | None:
     """Return the path of the system's Chromium, or None."""
@@ -46,7 +41,7 @@ def find_chromium() -> str | None:
 
 
 @pytest.fixture(scope="session")
-def browser() -> Iterator[Browser]:
+def browser():
     """A running browser."""
     program = find_chromium()
     if program is None:
@@ -75,9 +70,9 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture
-def open_page(browser: Browser, tmp_path: Path) -> Iterator[OpenPage]:
-    """A function that opens HTML from a file, as a reader does; errors of the page's script fail
-    the test.
+def open_page(browser, tmp_path):
+    """open_page(html, fragment="", *, width=800, height=600, webgl=True) opens HTML from a file, as
+    a reader does; errors of the page's script fail the test.
     """
     opened: list[Any] = []
     problems: list[str] = []

@@ -3,7 +3,6 @@
 import math
 import os
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 # The tests run in one process a core. Each of these, and the commands that they start, computes in
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 
 from browser import browser, open_page
-from scenes import Floats, cap_directions, directions_at, shade, spiral_lights
+from scenes import cap_directions, directions_at, shade, spiral_lights
 from small_pixel_sets import make_set
 from splinecli.system.progress import STAGES
 
@@ -22,14 +21,14 @@ __all__ = ["browser", "directions_at", "make_set", "open_page"]
 GOLDEN = Path(__file__).resolve().parent / "golden"
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
+def pytest_addoption(parser):
     parser.addoption(
         "--update-golden", action="store_true", help="write tests/golden/ anew; then read the diff"
     )
 
 
 @pytest.fixture(autouse=True)
-def no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_lines_of_progress(monkeypatch):
     """Print none of the lines that come every half minute, because a busy machine would add them to
     compared text.
     """
@@ -37,7 +36,7 @@ def no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_pictures(monkeypatch):
     """Save training runs without drawing the figures, which takes longer than the run itself."""
     monkeypatch.setattr(
         "splinecli.workshop.training.run_files.RunLog.draw", lambda self, maps: None
@@ -45,7 +44,7 @@ def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="session")
-def shared_data() -> Path:
+def shared_data():
     """Real captures that lie beside the repository on the authors' machines; none of them is part
     of it.
     """
@@ -56,7 +55,7 @@ def shared_data() -> Path:
 
 
 @pytest.fixture
-def matte_pixels() -> tuple[Floats, Floats, Floats]:
+def matte_pixels():
     """Normals (200, 3), 12 lights and observations (200, 12) of matte pixels,
     no shadow among them.
     """
@@ -66,7 +65,7 @@ def matte_pixels() -> tuple[Floats, Floats, Floats]:
 
 
 @pytest.fixture
-def glossy_pixels() -> tuple[Floats, Floats, Floats]:
+def glossy_pixels():
     """Normals (60, 3), 14 lights and observations (60, 14): Lambert's cosine, a Phong lobe,
     attached shadows.
     """
@@ -75,14 +74,14 @@ def glossy_pixels() -> tuple[Floats, Floats, Floats]:
 
 
 @pytest.fixture
-def golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
+def golden(request):
     """Compare a text with tests/golden/<name>; `pytest --update-golden` writes it anew, and the
     diff is read.
 
     What differs from run to run (seconds, memory, sizes of files, version) is blanked out.
     """
 
-    def check(name: str, text: str) -> None:
+    def check(name, text):
         path = GOLDEN / name
         text = _without_measurements(text)
         if request.config.getoption("--update-golden"):
@@ -92,7 +91,7 @@ def golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
     return check
 
 
-def _without_measurements(text: str) -> str:
+def _without_measurements(text):
     """The text with seconds, memory, sizes of files, version and absolute paths blanked out."""
     text = re.sub(r'("[a-z_0-9]+\.[a-z]+": )\d+', r"\1...", text)
     text = re.sub(

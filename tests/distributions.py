@@ -23,3 +23,8 @@ def assert_uniform(values: Tensor | NDArray[Any], low: float, high: float) -> No
     assert flat.min() >= low - margin
     assert flat.max() <= high + margin
     assert stats.kstest(flat, stats.uniform(low, high - low).cdf).pvalue > 1e-3
+
+
+def share(flags: Tensor) -> float:
+    """The share of flags that are set."""
+    return flags.double().mean().item()

@@ -7,6 +7,8 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import count
 from pathlib import Path
 from unittest.mock import patch
 
@@ -60,6 +62,18 @@ def killed_at(step: int, work: Callable[[], object]) -> bool:
         traceback.print_exc()
         os._exit(1)
     os._exit(0)
+
+
+def killed_at_every_step(
+    place: Path, prepare: Callable[[Path], object], work: Callable[[Path], object]
+) -> Iterator[Path]:
+    """Yield a folder for each change of files of the work: prepared, and killed before it."""
+    for step in count():
+        folder = place / str(step)
+        prepare(folder)
+        if not killed_at(step, partial(work, folder)):
+            return
+        yield folder
 
 
 def content(folder: Path) -> dict[str, bytes]:

@@ -17,6 +17,9 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
+FOUR_LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
+
+
 def directions_at(azimuth: Floats, zenith: Floats | float) -> Floats:
     """Return the unit directions (count, 3) at these angles in radians."""
     x, y, z = np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)
@@ -98,13 +101,29 @@ def read_image(path: str | Path) -> Any:
     return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
 
 
-def write_image(path: str | Path, pixels: NDArray[Any]) -> None:
-    """Write pixels (H, W) or (H, W, 3) BGR in the format of the name."""
+def put(path: Path, text: str = "", encoding: str = "utf-8") -> Path:
+    """Write a text into a file, whose folder need not exist."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+def write_image(path: str | Path, pixels: NDArray[Any]) -> Path:
+    """Write pixels (H, W) or (H, W, 3) BGR in the format of the name; the folder need not exist."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), pixels)
+    return path
 
 
 def read_json(path: str | Path) -> Any:
     return json.loads(Path(path).read_text("utf-8"))
+
+
+def codes(found: Any) -> list[str]:
+    """The codes of warnings, also of those in a report or of a capture."""
+    found = found["warnings"] if isinstance(found, dict) else getattr(found, "warnings", found)
+    return [each["code"] if isinstance(each, dict) else each.code for each in found]
 
 
 def write_capture(

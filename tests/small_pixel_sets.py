@@ -1,15 +1,14 @@
 """Small pixel sets for tests."""
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 from numpy.typing import DTypeLike
 
+from splinecli.maths.normals import unit
 from splinecli.workshop.pixel_sets.store import Pixels, PixelSet, PixelSetWriter
 
-MakeSet = Callable[..., PixelSet]
 THREE_SCENES = (("a", "one", 40, 30), ("b", "two", 30, 25), ("c", "three", 20, 12))
 
 
@@ -22,7 +21,7 @@ def matte_pixels(
     def upward(count: int) -> np.ndarray:
         vectors = random.standard_normal((count, 3))
         vectors[:, 2] = np.abs(vectors[:, 2]) + 0.1
-        return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+        return (unit(vectors)).astype(np.float32)
 
     normals, directions = upward(pixels), upward(lights)
     albedo = random.uniform(0.2, 1.0, (pixels, 1))
@@ -34,7 +33,7 @@ def matte_pixels(
 
 
 @pytest.fixture
-def make_set(tmp_path: Path) -> MakeSet:
+def make_set(tmp_path):
     """Write a finished set of matte pixels: entries as (name, scene, pixels, lights)."""
 
     def make(

@@ -6,7 +6,6 @@ import re
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ from scenes import read_json
 from splinecli import __version__
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
+from splinecli.maths.normals import unit
 from splinecli.workshop.save_weights import save_weights
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -24,10 +24,11 @@ Run = Callable[..., str]
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run the benchmark of this name and return what it prints."""
+def run(capsys):
+    """Run a benchmark, run("name --option value"), and return what it prints."""
 
-    def run_benchmark(name: str, *arguments: str) -> str:
+    def run_benchmark(command):
+        name, *arguments = command.split()
         importlib.import_module(name).main(arguments)
         return capsys.readouterr().out
 
@@ -35,13 +36,13 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 
 
 @pytest.fixture
-def coarse_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+def coarse_shapes(monkeypatch):
     """Drawn shapes of few triangles, which small pictures show as well."""
     monkeypatch.setattr("splinecli.workshop.synthesis.shapes.SPACING", 0.04)
     monkeypatch.setattr("splinecli.workshop.synthesis.shapes.FEWEST_FACES", 100)
 
 
-def numbers(line: str) -> list[float]:
+def numbers(line):
     return [
         float(number)
         for number in re.findall(r"(?<![\w-])\d+(?:\.\d+)?(?![\w-])", line.replace(",", ""))
@@ -66,13 +67,13 @@ SPEEDS = {
 
 @pytest.mark.parametrize("command", SPEEDS)
 def test_speeds(run, command):
-    printed = run(*command.split()).splitlines()[1:]
+    printed = run(command).splitlines()[1:]
     assert all(line.startswith(name) for line, name in zip(printed, SPEEDS[command], strict=True))
     assert all(min(numbers(line[25:])) > 0 for line in printed)
 
 
 def test_photographs(run):
-    printed = run("photographs", MEDALLION, "--draws", "1", "--pixels", "60")
+    printed = run(f"photographs {MEDALLION} --draws 1 --pixels 60")
     overexposed, intensities = printed.split("\n\n")
     assert len(numbers(overexposed.splitlines()[1])) == 4
     assert len(numbers(intensities.splitlines()[1])) == 7
@@ -82,9 +83,9 @@ def test_photographs(run):
 def test_faulty_captures(run, tmp_path, monkeypatch):
     pytest.importorskip("embreex", reason="needs the extra 'render'")
     monkeypatch.setattr("fit_capture_confidence.STEPS", 20)
-    printed = run("faulty_captures", str(tmp_path), "--scenes", "5", "--size", "24")
+    printed = run(f"faulty_captures {tmp_path} --scenes 5 --size 24")
     assert int(printed.split()[0]) > 5
-    rows = run("fit_capture_confidence", str(tmp_path)).splitlines()
+    rows = run(f"fit_capture_confidence {tmp_path}").splitlines()
     assert rows[0].startswith("| capture | number | claimed before")
     assert "right" in rows[2] + rows[-1] + rows[-2]
     assert all(len(numbers(row)) == 8 for row in rows[2:])
@@ -92,16 +93,7 @@ def test_faulty_captures(run, tmp_path, monkeypatch):
 
 def test_faulty_captures_of_pixel_sets(run, make_set, tmp_path):
     folder = str(make_set(entries=[("a", "one", 400, 30)]).folder)
-    run(
-        "faulty_captures",
-        str(tmp_path / "made"),
-        "--scenes",
-        "4",
-        "--part",
-        "2/2",
-        "--sets",
-        folder,
-    )
+    run(f"faulty_captures {tmp_path}/made --scenes 4 --part 2/2 --sets {folder}")
     made = [dict(np.load(path)) for path in (tmp_path / "made").glob("*.npz")]
     assert len(made) >= 4
     assert len({int(each["scene"]) for each in made}) == 1
@@ -116,8 +108,8 @@ def test_faulty_captures_of_pixel_sets(run, make_set, tmp_path):
 def test_render_accuracy(run):
     pytest.importorskip("mitsuba", reason="compares with Mitsuba 3")
     pytest.importorskip("embreex", reason="needs the extra 'render'")
-    arguments = ("--size", "12", "--samples", "4", "--scenes", "1", "--directions", "4")
-    printed = run("render_accuracy", *arguments).splitlines()
+    arguments = "--size 12 --samples 4 --scenes 1 --directions 4"
+    printed = run(f"render_accuracy {arguments}").splitlines()
     assert [line.split()[0] for line in printed[2:5]] == ["diffuse", "specular", "metallic"]
     assert printed[-1].count("%") == 3
 
@@ -125,9 +117,7 @@ def test_render_accuracy(run):
 @pytest.mark.usefixtures("coarse_shapes")
 def test_near_lamps(run):
     pytest.importorskip("embreex", reason="needs the extra 'render'")
-    printed = run(
-        "near_lamps", "--size", "16", "--method", "ls", "--widths", "4", "--off", "0.8"
-    ).splitlines()
+    printed = run("near_lamps --size 16 --method ls --widths 4 --off 0.8").splitlines()
     assert len(printed) == 8
     plane = next(row for row in printed if row.split()[:2] == ["matte", "plane"])
     distant, distant_range, as_distant, bowl, near, near_range, *_ = numbers(plane)
@@ -137,9 +127,7 @@ def test_near_lamps(run):
 
 
 def test_inspection(run):
-    printed = run(
-        "inspection", "--size", "96", "--plates", "1", "--depths", "0.5", "--method", "ls"
-    ).splitlines()
+    printed = run("inspection --size 96 --plates 1 --depths 0.5 --method ls").splitlines()
     assert printed[2:] == [
         "| dent | 0.5 | 4 of 4 | 4 of 4 |",
         "| scratch | 0.5 | 4 of 4 | 4 of 4 |",
@@ -148,8 +136,8 @@ def test_inspection(run):
 
 def test_large_captures(run, tmp_path):
     plot = tmp_path / "plot.png"
-    arguments = ("--megapixels", "0.001", "--method", "ls", "--plot", str(plot))
-    header, row = run("large_captures", *arguments).splitlines()
+    arguments = f"--megapixels 0.001 --method ls --plot {plot}"
+    header, row = run(f"large_captures {arguments}").splitlines()
     assert header.split()[0] == "megapixels"
     assert numbers(row)[0] == pytest.approx(0.001, abs=2e-4)
     assert row.endswith("exact")
@@ -187,25 +175,18 @@ def test_all_figures(run, tmp_path):
         place.parent.mkdir(parents=True, exist_ok=True)
         place.symlink_to(MEDALLION)
     stored = tmp_path / "figures.json"
-    places = (
-        str(tmp_path / "data"),
-        "--results",
-        str(tmp_path / "results"),
-        "--figures",
-        str(stored),
-    )
-    arguments = (*places, "--trials", "2", "--only", "noise/ls")
-    assert run("all_figures", *arguments).startswith("noise, ls: ")
+    command = f"all_figures {tmp_path}/data --results {tmp_path}/results --figures {stored}"
+    assert run(f"{command} --trials 2 --only noise/ls").startswith("noise, ls: ")
     measured = read_json(stored)["noise"]
     assert (measured["version"], len(measured["weights"])) == (__version__, 8)
     assert list(measured["rows"]) == ["ls"]
     assert list(measured["rows"]["ls"]) == ["0", "2", "4", "8"]
     assert measured["rows"]["ls"]["0"] < measured["rows"]["ls"]["8"]
-    assert run("all_figures", *arguments) == ""
+    assert run(f"{command} --trials 2 --only noise/ls") == ""
 
 
 def test_wrong_lights(run):
-    rows = run("wrong_lights", MEDALLION, "--scenes", "0", "--draws", "1").splitlines()
+    rows = run(f"wrong_lights {MEDALLION} --scenes 0 --draws 1").splitlines()
     cells = dict(
         row.strip("| ").split(" | ") for row in rows if row.count("|") == 3 and "---" not in row
     )
@@ -223,9 +204,8 @@ def test_measured_spheres(run, shared_data, tmp_path):
     materials = shared_data / "merl_nbrdf/merl_nbrdf.npz"
     untrained = tmp_path / "untrained.safetensors"
     save_weights(SplineNet(NetworkConfig()), untrained)
-    weights = "--weights", "spline-net", "--weights", str(untrained)
-    arguments = (str(materials), str(lights), *weights, "--draws", "1", "--pixels", "4")
-    printed = run("measured_spheres", *arguments).splitlines()
+    arguments = f"--weights spline-net --weights {untrained} --draws 1 --pixels 4"
+    printed = run(f"measured_spheres {materials} {lights} {arguments}").splitlines()
     trained, fit = (float(re.findall(r": (\S+) degrees", line)[0]) for line in printed)
     assert trained < 0.7 * fit
 
@@ -247,17 +227,17 @@ def test_measured_materials_are_those_of_explicit_vectors(tmp_path):
     )
     assert materials.names == ["first", "third"]  # not the implausible one
     normals, lights = (random.normal((0, 0, 2), 1, (count, 3)) for count in (6, 20))
-    normals, lights = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (normals, lights))
+    normals, lights = (unit(v) for v in (normals, lights))
     n, light = (torch.from_numpy(v).float() for v in (normals, lights))
     shaded = materials.shade(torch.tensor([0, 1] * 3), n @ light.T, n[:, 2:], light[:, 2])
     for pixel, column in np.ndindex(6, 20):
         expected = _brdf(arrays, 2 * (pixel % 2), normals[pixel], lights[column])
-        expected *= math.pi * max(normals[pixel] @ lights[column], 0)
+        expected *= math.pi * max(float(normals[pixel] @ lights[column]), 0)
         # In float32, the angles are known to some 1e-4 where half vector and normal all but meet.
         assert shaded[pixel, column].item() == pytest.approx(expected, rel=1e-3, abs=1e-5)
 
 
-def _brdf(arrays: dict[str, Any], material: int, n: Any, light: Any) -> float:
+def _brdf(arrays, material, n, light):
     """The gray BRDF by Rusinkiewicz's definition, with rotations of explicit vectors,
     in float64.
     """
@@ -283,6 +263,6 @@ def _brdf(arrays: dict[str, Any], material: int, n: Any, light: Any) -> float:
 @pytest.mark.usefixtures("coarse_shapes")
 def test_materials(run):
     pytest.importorskip("embreex", reason="needs the extra 'render'")
-    printed = run("materials", "--scenes", "1", "--size", "16", "--sets", "metallic").splitlines()
+    printed = run("materials --scenes 1 --size 16 --sets metallic").splitlines()
     assert "material" in printed[0]
     assert [line.split("|")[1].strip() for line in printed[3:5]] == ["all", "highlight observable"]

@@ -3,7 +3,6 @@
 import doctest
 import re
 import shlex
-from collections.abc import Iterator
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
@@ -24,15 +23,15 @@ PACKAGE = Path(splinecli.__file__).parent
 PAGES = sorted([*REPOSITORY.glob("*.md"), *DOCS.glob("*.md"), REPOSITORY / "examples/README.md"])
 
 
-def text_of(name: str) -> str:
+def text_of(name):
     return (REPOSITORY / name).read_text("utf-8")
 
 
-def by_name(path: Path) -> str:
+def by_name(path):
     return str(path.relative_to(REPOSITORY))
 
 
-def anchors(page: Path) -> set[str]:
+def anchors(page):
     """The anchors of the headings, as GitHub makes them."""
     headings = re.findall(r"^#+ (.*)$", page.read_text("utf-8"), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading).lower().replace(" ", "-") for heading in headings}
@@ -74,7 +73,7 @@ def test_pages_are_short():
     assert {name: number for name, number in words.items() if number > 1500} == {}
 
 
-def commands() -> Iterator[tuple[str, str]]:
+def commands():
     """Page and command line of every splinecli command in the code blocks and tables of the
     documentation.
     """
@@ -90,7 +89,7 @@ def commands() -> Iterator[tuple[str, str]]:
                     yield by_name(page), words.removeprefix(".venv/bin/")
 
 
-@pytest.mark.parametrize(("page", "command"), sorted(set(commands())))
+@pytest.mark.parametrize("page, command", sorted(set(commands())))
 def test_commands_have_options_that_exist(page, command):
     group: Any = typer.main.get_command(app)
     _, *words = shlex.split(command, comments=True)
@@ -136,7 +135,7 @@ def test_python_page(tmp_path, monkeypatch):
     ):
         assert code.count(before) == 1
         code = code.replace(before, after)
-    names: dict[str, Any] = {}
+    names = {}
     exec(code, names)
     assert names["heights"].shape == names["capture"].mask.shape
     assert names["estimate"].errors.mean < 7

@@ -9,8 +9,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,17 +28,17 @@ TUTORIAL = EXAMPLES.parent / "docs/tutorial.md"
 ONE_COUNT = 1
 
 
-def read_png(path: Path) -> Any:
+def read_png(path):
     pixels = read_image(path)
     return pixels[..., ::-1] if pixels.ndim == 3 else pixels
 
 
-def counts_apart(a: Any, b: Any) -> int:
+def counts_apart(a, b):
     return int(np.abs(a.astype(np.int64) - b.astype(np.int64)).max())
 
 
 @pytest.fixture(scope="module")
-def script() -> ModuleType:
+def script():
     spec = importlib.util.spec_from_file_location("render_capture", EXAMPLES / "render_capture.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

@@ -18,7 +18,7 @@ HEIGHT = {room: -level for level, rooms in enumerate(ROOMS) for room in rooms}
 SOURCE = Path(splinecli.__file__).parent
 
 
-def imported_rooms(tree: ast.AST) -> set[str]:
+def imported_rooms(tree):
     modules = []
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("splinecli"):

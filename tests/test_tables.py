@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from numpy.typing import NDArray
 
 import make_tables
 import splinecli
 from html_page import REPORT
 from judged import warnings_of
+from scenes import FOUR_LIGHTS, codes
 from splinecli.capture import Capture
 from splinecli.capture.files import NOT_PHOTOGRAPHS
 from splinecli.cli.main import app
 from splinecli.errors import InputError
-from splinecli.estimate.inference import NormalEstimate, estimate_normals
+from splinecli.estimate.inference import estimate_normals
 from splinecli.estimate.methods import METHODS, Estimator, Method, make_estimator, method_names
 from splinecli.judge import checks
 from splinecli.pictures.maps import signed_picture
@@ -31,12 +31,11 @@ from splinecli.results.maps import chosen_maps, make_map, map_files
 from splinecli.results.pages import result_page
 
 SOURCE = Path(splinecli.__file__).parent
-LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
 
 
-def capture() -> Capture:
+def capture():
     observations = np.ones((6, 4), np.float32)
-    return Capture("flat", observations, LIGHTS, tuple(range(4)), np.ones((2, 3), np.bool_))
+    return Capture("flat", observations, FOUR_LIGHTS, tuple(range(4)), np.ones((2, 3), np.bool_))
 
 
 @pytest.mark.parametrize("name", make_tables.PAGES)
@@ -65,7 +64,7 @@ class Flat(Estimator):
     def estimate(self, observations, light_directions, *, progress=None):
         return np.tile((0.0, 0.0, 1.0), (len(observations), 1))
 
-    def warn_of_lights(self, n_lights: int) -> list[str]:
+    def warn_of_lights(self, n_lights):
         return [f"{n_lights} lights are not needed."]
 
 
@@ -99,7 +98,7 @@ def test_a_warning_is_a_row(monkeypatch):
 
     monkeypatch.setattr(checks, "CHECKS", [*checks.CHECKS, checks.Check(check)])
     warnings = warnings_of(capture())
-    assert "uniform" in [warning.code for warning in warnings]
+    assert "uniform" in codes(warnings)
     with pytest.raises(InputError, match="All values are equal"):
         checks.refuse_if_strict(warnings[-1:], "flat", strict=True)
 
@@ -145,7 +144,7 @@ def test_a_map_is_a_row(monkeypatch):
     assert InferOptions.from_arguments(given).map_scales == (("slant", 0.5),)
 
 
-def slant(source: object, estimate: NormalEstimate, progress: object) -> NDArray[np.float32]:
+def slant(source, estimate, progress):
     return estimate.normal_map[..., 2]
 
 

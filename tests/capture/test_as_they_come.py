@@ -7,7 +7,6 @@ The oracle is a matte sphere: whatever its files are called, the normals are tho
 import json
 import re
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -17,14 +16,8 @@ import tifffile
 from PIL import Image
 
 import scenes
-from scenes import to_uint16, write_image
-from splinecli.capture import (
-    CaptureOptions,
-    CaptureSource,
-    Overrides,
-    find_capture_files,
-    open_capture,
-)
+from scenes import codes, to_uint16, write_image
+from splinecli.capture import CaptureOptions, Overrides, find_capture_files, open_capture
 from splinecli.capture.formats.images import decode_image
 from splinecli.capture.light_files import read_light_positions
 from splinecli.errors import InputError, UsageError
@@ -42,16 +35,14 @@ NORMALS, DISC = scenes.sphere(SIZE, 0.6)
 PICTURES = to_uint16(np.moveaxis(scenes.shade(NORMALS, LIGHTS), -1, 0) * 50_000)
 MASK = DISC.astype(np.uint8) * 255
 
-Change = Callable[[Path], Path | None]
-
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     """Return a capture without a mask."""
     return scenes.write_capture(tmp_path / "cat", PICTURES, LIGHTS)
 
 
-def check(source: CaptureSource, mask: np.ndarray | None = DISC) -> list[str]:
+def check(source, mask=DISC):
     """Compare the normals with the geometry, and return the codes of the warnings."""
     capture = prepare_capture(source, options=RecipeOptions(as_stored=True))
     assert mask is None or (capture.mask == mask).all()
@@ -60,19 +51,14 @@ def check(source: CaptureSource, mask: np.ndarray | None = DISC) -> list[str]:
     # 16-bit values as stored, without shadows: least squares is exact to a few thousandths of a
     # degree.
     assert angle_between_deg(normals[inside], NORMALS[inside]).max() < 0.1
-    return [warning.code for warning in capture.warnings]
-
-
-def picture(path: Path, image: np.ndarray) -> None:
-    path.parent.mkdir(exist_ok=True)
-    write_image(path, image)
+    return codes(capture)
 
 
 @pytest.mark.parametrize(
     "name", ["cat_mask.png", "cat.mask.tif", "mask_1.png", "../cat_mask.png", "../cat.mask.bmp"]
 )
 def test_masks_by_name(folder, name):
-    picture(folder / name, MASK)
+    write_image(folder / name, MASK)
     source = open_capture(folder)
     assert check(source) == ["mask_choice"]
     assert str(source.warnings[0]).startswith(
@@ -83,9 +69,9 @@ def test_masks_by_name(folder, name):
 
 
 def test_two_masks_are_named_and_none_is_used(folder):
-    picture(folder / "mask_left.png", MASK)
-    picture(folder / "mask_right.png", MASK)
-    picture(folder / "mask_small.png", MASK[::2, ::2])
+    write_image(folder / "mask_left.png", MASK)
+    write_image(folder / "mask_right.png", MASK)
+    write_image(folder / "mask_small.png", MASK[::2, ::2])
     source = open_capture(folder)
     assert check(source, np.ones_like(DISC)) == ["mask_choice"]
     expected = (
@@ -99,13 +85,13 @@ def test_two_masks_are_named_and_none_is_used(folder):
 
 def test_alpha_is_a_mask_if_there_is_no_other(folder):
     for number, image in enumerate(PICTURES):
-        picture(
+        write_image(
             folder / f"{number:03}.png", np.dstack([image] * 3 + [MASK.astype(np.uint16) * 257])
         )
     source = open_capture(folder)
     assert check(source) == ["mask_choice"]
     assert "The alpha channel of 000.png is used as the mask." in str(source.warnings[0])
-    picture(folder / "mask.png", np.full_like(MASK, 255))
+    write_image(folder / "mask.png", np.full_like(MASK, 255))
     assert check(open_capture(folder), np.ones_like(DISC)) == []
 
 
@@ -116,23 +102,25 @@ def test_images_in_a_folder_of_their_own(folder, listed):
         path.rename(folder / "images" / path.name)
     if listed:
         (folder / "filenames.txt").write_text("".join(f"{number:03}.png\n" for number in range(12)))
-    picture(folder / "cat_mask.png", MASK)
+    write_image(folder / "cat_mask.png", MASK)
     source = open_capture(folder)
     assert check(source) == ["mask_choice"]
     assert source.files.name == "cat" and len(source.files.images) == 12
 
 
 def test_bmp_ground_truth(folder):
-    picture(folder / "normals_gt.bmp", np.rint((NORMALS[..., ::-1] + 1) * 127.5).astype(np.uint8))
+    write_image(
+        folder / "normals_gt.bmp", np.rint((NORMALS[..., ::-1] + 1) * 127.5).astype(np.uint8)
+    )
     truth = prepare_capture(open_capture(folder, CaptureOptions(mask=None))).ground_truth
     assert truth is not None and angle_between_deg(truth[DISC], NORMALS[DISC]).max() < 1
 
 
-def rows(vectors: np.ndarray = LIGHTS) -> list[list[float]]:
+def rows(vectors=LIGHTS):
     return vectors.tolist()
 
 
-def angles(form: str) -> str:
+def angles(form):
     slant, tilt = np.degrees([np.arccos(LIGHTS[:, 2]), np.arctan2(LIGHTS[:, 1], LIGHTS[:, 0])])
     columns = (tilt, 90 - slant) if form == "azel" else (tilt, slant)
     return "\n".join(f"{first:.9f} {second:.9f}" for first, second in zip(*columns, strict=True))
@@ -147,7 +135,7 @@ OPENCV = (
 XYZ = [dict(zip("xyz", row, strict=True)) for row in rows()]
 
 
-def alice(names: list[str], **more: object) -> str:
+def alice(names, **more):
     lights = [
         {"viewId": n, "direction": [x, -y, -z], **more}
         for n, (x, y, z) in zip(names, rows(), strict=True)
@@ -262,8 +250,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "message"),
-    [(name, *case) for name, cases in REFUSED.items() for case in cases],
+    "name, text, message", [(name, *case) for name, cases in REFUSED.items() for case in cases]
 )
 def test_refused_light_files(folder, name, text, message):
     (folder / "light_directions.txt").unlink()
@@ -296,12 +283,12 @@ def test_umlauts_of_older_programs_and_images_that_are_not_named(folder):
     assert [path.name for path in source.files.images] == [
         f"schräg {number}.png" for number in NUMBERS[:4]
     ]
-    assert [warning.code for warning in source.warnings] == ["images_left_out"]
+    assert codes(source) == ["images_left_out"]
     assert "names 4 of the 12 images; the others were left out" in str(source.warnings[0])
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "hint"),
+    "name, text, hint",
     [
         ("../lights.txt", LINES, r"Add --lights .*lights\.txt\."),
         ("dirs.txt", LINES, r"Add --lights .*cat/dirs\.txt\."),
@@ -358,7 +345,7 @@ def test_one_bad_light_is_left_out(folder, vector):
 
 def test_copies_are_one_photograph(folder):
     for number, image in enumerate(PICTURES):
-        picture(folder / f"{number:03}.jpg", (image >> 8).astype(np.uint8))
+        write_image(folder / f"{number:03}.jpg", (image >> 8).astype(np.uint8))
     source = open_capture(folder)
     assert check(source, None) == ["images_left_out"]
     assert str(source.warnings[0]).startswith(
@@ -368,7 +355,7 @@ def test_copies_are_one_photograph(folder):
 
 def test_pictures_of_results_are_left_out_where_the_count_says_so(folder):
     for name in ("demo.png", "result_1.png", "result_2.png"):
-        picture(folder / name, PICTURES[0])
+        write_image(folder / name, PICTURES[0])
     source = open_capture(folder)
     assert check(source, None) == ["images_left_out"]
     assert "no light for them, and the other images have another form of name" in str(
@@ -376,20 +363,20 @@ def test_pictures_of_results_are_left_out_where_the_count_says_so(folder):
     )
     assert len(find_capture_files(folder, Overrides(needs_lights=False)).images) == 12
     for number in (12, 13):
-        picture(folder / f"{number:03}.png", PICTURES[0])
+        write_image(folder / f"{number:03}.png", PICTURES[0])
     with pytest.raises(
         InputError, match=r"found 12 light directions, expected 17.* it has none for 012\.png"
     ):
         open_capture(folder)
 
 
-def write_pnm(path: Path, image: np.ndarray, most: int) -> None:
+def write_pnm(path, image, most):
     path.with_suffix(".pgm").write_bytes(
         b"P5 # camera\n%d %d\n%d\n" % (*image.shape[::-1], most) + image.astype(">u2").tobytes()
     )
 
 
-def write_stack(folder: Path) -> None:
+def write_stack(folder):
     tifffile.imwrite(folder / "stack.tif", PICTURES, photometric="minisblack")
 
 
@@ -401,7 +388,7 @@ WRITERS = {
         write_pnm(folder / f"{n}", PICTURES[n] >> 4, 4095) for n in range(12)
     ],
     "PPM": lambda folder: [
-        picture(folder / f"{n}.ppm", np.dstack([PICTURES[n]] * 3)) for n in range(12)
+        write_image(folder / f"{n}.ppm", np.dstack([PICTURES[n]] * 3)) for n in range(12)
     ],
     "stack": write_stack,
     # OpenCV's TIFF is LZW
@@ -414,7 +401,7 @@ def test_images_of_other_formats(folder, form):
     for path in folder.glob("*.png"):
         path.unlink()
     WRITERS[form](folder)
-    picture(folder.parent / "mask.png", MASK)
+    write_image(folder.parent / "mask.png", MASK)
     source = open_capture(folder, CaptureOptions(mask=folder.parent / "mask.png"))
     assert source.n_lights == 12
     check(source)
@@ -434,12 +421,12 @@ def test_display_encoded_formats(folder, suffix):
         (folder / f"{number:03}.png").unlink()
         options = {"lossless": True} if suffix == ".webp" else {"quality": 100}
         Image.fromarray(np.dstack([image] * 3)).save(folder / f"{number:03}{suffix}", **options)
-    picture(folder.parent / "mask.png", MASK)
+    write_image(folder.parent / "mask.png", MASK)
     capture = prepare_capture(
         open_capture(folder, CaptureOptions(mask=folder.parent / "mask.png")),
         options=RecipeOptions(as_stored=True),
     )
-    assert "display_decoded" in [warning.code for warning in capture.warnings]
+    assert "display_decoded" in codes(capture)
     normals = estimate_normals(capture, make_estimator("ls")).normal_map
     # Steps of 8 bits are half a percent of the brightness.
     assert angle_between_deg(normals[DISC], NORMALS[DISC]).mean() < 0.5

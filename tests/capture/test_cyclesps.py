@@ -2,9 +2,6 @@
 value for value.
 """
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 import tifffile
@@ -21,7 +18,7 @@ LIGHTS = np.array(
 )
 
 
-def normals() -> np.ndarray:
+def normals():
     """Unit normals (HEIGHT, WIDTH, 3) that no mirror image or exchange of axes maps onto each
     other.
     """
@@ -29,7 +26,7 @@ def normals() -> np.ndarray:
     return np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
 
 
-def boundaries() -> tuple[np.ndarray, np.ndarray]:
+def boundaries():
     """The inner mask and the one of the rim, 21 and 14 of 77 pixels; neither contains the other."""
     inner, rim = np.zeros((2, HEIGHT, WIDTH), np.uint8)
     inner[2:5, 2:9] = 1  # any value above zero counts, whatever the largest
@@ -39,9 +36,7 @@ def boundaries() -> tuple[np.ndarray, np.ndarray]:
     return inner, rim
 
 
-def write_object(
-    folder: Path, *kinds: str, seed: int = 0, n_lights: int = 5
-) -> dict[str, np.ndarray]:
+def write_object(folder, *kinds, seed=0, n_lights=5):
     """An object as published; returns the images (F, H, W, 3) of each kind."""
     folder.mkdir(parents=True)
     np.savetxt(folder / "light.txt", LIGHTS[:n_lights], fmt="%.6f")
@@ -60,7 +55,7 @@ def write_object(
 
 
 @pytest.fixture
-def tree(tmp_path: Path) -> Path:
+def tree(tmp_path):
     """The root of a tree with two objects, in all three kinds."""
     root = tmp_path / "CyclesPS"
     for seed, name in enumerate(("Bunny10", "Bunny9")):
@@ -69,7 +64,7 @@ def tree(tmp_path: Path) -> Path:
     return root
 
 
-def message(call: Callable[[], object]) -> str:
+def message(call):
     with pytest.raises(InputError) as caught:
         call()
     return str(caught.value)

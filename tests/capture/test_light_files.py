@@ -15,19 +15,14 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.io import savemat
 
-from scenes import write_image
+from scenes import put, write_image
 from splinecli.capture import read_light_directions, read_light_intensities
 from splinecli.capture.light_files import light_encoder, match_images, read_lights
 from splinecli.errors import InputError
+from splinecli.maths.normals import unit
 
 DIRECTIONS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, -0.6, 0.8], [-0.48, 0.36, 0.8]])
 ROWS = ["0 0 1", "0.6 0 0.8", "0 -0.6 0.8", "-0.48 0.36 0.8"]
-
-
-def write(folder: Path, text: str, encoding: str = "utf-8") -> Path:
-    path = folder / "lights.txt"
-    path.write_bytes(text.encode(encoding))
-    return path
 
 
 FORMS = {
@@ -55,13 +50,15 @@ FORMS = {
 @pytest.mark.parametrize("form", FORMS)
 def test_directions(tmp_path, form):
     for encoding in ("utf-8", "utf-8-sig", "utf-16"):
-        directions = read_light_directions(write(tmp_path, FORMS[form], encoding), 4)
+        directions = read_light_directions(put(tmp_path / "lights.txt", FORMS[form], encoding), 4)
         assert directions.dtype == np.float64
         assert_allclose(directions, DIRECTIONS, atol=1e-15)
 
 
 def test_lengths_far_from_one_neither_overflow_nor_underflow(tmp_path):
-    directions = read_light_directions(write(tmp_path, "0 3e300 4e300\n0 3e-300 4e-300\n0 0 1"))
+    directions = read_light_directions(
+        put(tmp_path / "lights.txt", "0 3e300 4e300\n0 3e-300 4e-300\n0 0 1")
+    )
     assert_allclose(directions[:2], [[0, 0.6, 0.8]] * 2)
 
 
@@ -82,9 +79,11 @@ def test_directions_round_trip(vectors, separator, counted, transposed):
         separator.join(repr(float(v)) for v in row) for row in (values.T if transposed else values)
     ]
     with tempfile.TemporaryDirectory() as folder:
-        path = write(Path(folder), "\n".join(([str(len(values))] if counted else []) + rows))
+        path = put(
+            Path(folder, "lights.txt"), "\n".join(([str(len(values))] if counted else []) + rows)
+        )
         directions = read_light_directions(path, len(values))
-    expected = values / np.linalg.norm(values, axis=1, keepdims=True)
+    expected = unit(values)
     assert_allclose(directions, expected, rtol=1e-12, atol=1e-15)
 
 
@@ -92,7 +91,7 @@ COMMA = "A comma separates columns; write decimals with a point."
 
 
 @pytest.mark.parametrize(
-    ("text", "line", "message"),
+    "text, line, message",
     [
         ("0 0 1\n\n0 1\n0 1 1", 3, "found 2 columns, expected 3 as in the other lines"),
         ("0 0 1 1\n" * 5, 1, "found 4 columns, expected 3 (x y z)"),
@@ -122,7 +121,7 @@ COMMA = "A comma separates columns; write decimals with a point."
     ],
 )
 def test_wrong_directions(tmp_path, text, line, message):
-    path = write(tmp_path, text)
+    path = put(tmp_path / "lights.txt", text)
     with pytest.raises(InputError) as caught:
         read_light_directions(path, 5 if line is None else None)
     assert str(caught.value).startswith(
@@ -133,7 +132,7 @@ def test_wrong_directions(tmp_path, text, line, message):
 
 def test_files_that_are_no_text(tmp_path):
     write_image(tmp_path / "mask.png", np.zeros((3, 3), np.uint8))
-    write(tmp_path, "0 0 1 # \u00e9", encoding="latin-1")
+    put(tmp_path / "lights.txt", "0 0 1 # \u00e9", encoding="latin-1")
     for name, message in (
         ("none.txt", r"none\.txt: the file does not exist\."),
         (".", r"found a folder, expected a text file with a line x y z for"),
@@ -164,11 +163,13 @@ def test_intensities(tmp_path, text):
         if text in GRAY
         else [[1, 2, 4], [2, 2, 2], [1, 1, 1], [3, 3, 3]]
     )
-    np.testing.assert_array_equal(read_light_intensities(write(tmp_path, text), 4), expected)
+    np.testing.assert_array_equal(
+        read_light_intensities(put(tmp_path / "lights.txt", text), 4), expected
+    )
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text, message",
     [
         ("1 1 1\n1 0 1\n1 1 1\n1 1 1", ":2: found the intensity 0, expected a number above 0."),
         (
@@ -185,7 +186,7 @@ def test_intensities(tmp_path, text):
     ],
 )
 def test_wrong_intensities(tmp_path, text, message):
-    path = write(tmp_path, text)
+    path = put(tmp_path / "lights.txt", text)
     with pytest.raises(InputError) as caught:
         read_light_intensities(path, 4)
     assert str(caught.value).startswith(f"{path}{message}")
@@ -194,10 +195,9 @@ def test_wrong_intensities(tmp_path, text, message):
 @pytest.mark.parametrize("n_images", [None, 4])
 def test_one_light_in_each_column_is_no_count(tmp_path, n_images):
     # The first column, 1 3 2, would count three lights.
-    path = write(tmp_path, "1 0 0 1\n3 1 0 0\n2 1 1 1")
-    expected = np.array([[1, 3, 2], [0, 1, 1], [0, 0, 1], [1, 0, 1]])
-    expected = expected / np.linalg.norm(expected, axis=1, keepdims=True)
-    assert_allclose(read_light_directions(path, n_images), expected)
+    path = put(tmp_path / "lights.txt", "1 0 0 1\n3 1 0 0\n2 1 1 1")
+    expected = np.array([[1.0, 3, 2], [0, 1, 1], [0, 0, 1], [1, 0, 1]])
+    assert_allclose(read_light_directions(path, n_images), unit(expected))
 
 
 @pytest.mark.parametrize(
@@ -215,7 +215,7 @@ def test_one_light_in_each_column_is_no_count(tmp_path, n_images):
 @pytest.mark.parametrize("stem", ["img", "2024_0"])
 def test_rows_that_name_their_image(tmp_path, text, stem):
     """A name such as 2024_01, which Python would read as a number, is a name."""
-    table, directions = read_lights(write(tmp_path, text.replace("img", stem)), 4)
+    table, directions = read_lights(put(tmp_path / "lights.txt", text.replace("img", stem)), 4)
     wanted = [Path(f"{stem}{number}.png") for number in (1, 2, 3, 10)]
     images, how = match_images(table, wanted)
     assert how.startswith("name")
@@ -224,7 +224,7 @@ def test_rows_that_name_their_image(tmp_path, text, stem):
 
 
 @pytest.mark.parametrize(
-    ("factors", "message"),
+    "factors, message",
     [
         ([1, 2, 4, 8], None),
         ([1, 2, 4], "3 factors for 4 lights"),
@@ -264,7 +264,9 @@ def test_written_lights_are_read_again(tmp_path, suffix):
 def test_angles(tmp_path, text):
     # atan2(0.36, -0.48) = 143.13 degrees, asin(0.8) = 53.13 degrees.
     counted = "2 0 53.130102\n1 0 90\n3 270 53.130102\n4 143.130102 53.130102"
-    directions = read_light_directions(write(tmp_path, text or counted), 4, form="azel")
+    directions = read_light_directions(
+        put(tmp_path / "lights.txt", text or counted), 4, form="azel"
+    )
     assert_allclose(directions, DIRECTIONS, atol=1e-7)
 
 
@@ -272,7 +274,7 @@ ADD_AZEL = ".*add --light-format azel"
 
 
 @pytest.mark.parametrize(
-    ("form", "text", "message"),
+    "form, text, message",
     [
         (
             "xyz",
@@ -316,10 +318,10 @@ ADD_AZEL = ".*add --light-format azel"
 )
 def test_angles_and_vectors_are_not_mistaken_for_each_other(tmp_path, form, text, message):
     with pytest.raises(InputError, match=message):
-        read_lights(write(tmp_path, text), text.count("\n") + 1, form=form)
+        read_lights(put(tmp_path / "lights.txt", text), text.count("\n") + 1, form=form)
 
 
-def write_opencv(path: Path, **matrices: np.ndarray) -> Path:
+def write_opencv(path, **matrices):
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     for name, matrix in matrices.items():
         storage.write(name, np.ascontiguousarray(matrix, np.float64))
@@ -365,7 +367,7 @@ def test_refused_arrays(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "problem"),
+    "name, content, problem",
     [
         ("a.yml", b"", "no matrix"),
         (
@@ -395,7 +397,7 @@ def test_damaged_matrices(tmp_path, name, content, problem):
 
 
 @pytest.mark.parametrize(
-    ("name", "start", "unit"),
+    "name, start, unit",
     [
         ("a.yml", "", "\n"),
         ("a.yml", "lights: ", "\n"),

@@ -5,48 +5,41 @@ what the record refuses; reading ahead.
 import subprocess
 import sys
 import threading
-from collections.abc import Iterable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import tifffile
-from numpy.typing import NDArray
+from numpy.testing import assert_allclose, assert_array_equal
 
-from capture.conftest import WriteImage
-from scenes import ring_lights, write_capture
-from splinecli.capture import Capture, CaptureWarning, open_capture
+from scenes import FOUR_LIGHTS, ring_lights, write_capture
+from splinecli.capture import Capture, open_capture
 from splinecli.capture import source as module
 from splinecli.capture.source import read_ahead
 from splinecli.errors import InputError, UsageError
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.recipe import prepare_capture, read_capture
 
-LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
 INTENSITIES = np.array([[1, 2, 4], [2, 2, 2], [0.5, 1, 3], [1, 1, 1]])
 
 
 @pytest.fixture
-def photographs() -> NDArray[np.uint16]:
+def photographs():
     """(4, 5, 6, 3) 16-bit RGB values, none of them saturated."""
     return np.random.default_rng(1).integers(0, 65000, (4, 5, 6, 3)).astype(np.uint16)
 
 
 @pytest.fixture
-def capture_folder(tmp_path: Path, photographs: NDArray[np.uint16]) -> Path:
+def capture_folder(tmp_path, photographs):
     """tmp_path/vase: four photographs and light_directions.txt, nothing else."""
     # img8, img9, img10, img11: not in the order of text
-    return write_capture(tmp_path / "vase", photographs, LIGHTS, names="img{}.png", first=8)
+    return write_capture(tmp_path / "vase", photographs, FOUR_LIGHTS, names="img{}.png", first=8)
 
 
-def texts(warnings: Iterable[CaptureWarning]) -> tuple[str, ...]:
+def texts(warnings):
     return tuple(str(warning) for warning in warnings)
 
 
-def expected(
-    photographs: NDArray[np.uint16], intensities: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def expected(photographs, intensities):
     """(P, F) for the whole image, in float64."""
     return np.asarray(
         (photographs / 65535 / intensities[:, None, None])
@@ -58,9 +51,7 @@ def expected(
 
 def test_observations_mask_and_ground_truth(capture_folder, write_image, photographs):
     capture = read_capture(capture_folder)
-    np.testing.assert_allclose(
-        capture.observations, expected(photographs, np.ones((4, 3))), rtol=1e-6
-    )
+    assert_allclose(capture.observations, expected(photographs, np.ones((4, 3))), rtol=1e-6)
     assert capture.observations.dtype == np.float32
     assert (capture.name, capture.light_indices, capture.ground_truth) == (
         "vase",
@@ -68,25 +59,23 @@ def test_observations_mask_and_ground_truth(capture_folder, write_image, photogr
         None,
     )
     assert (capture.warnings, capture.mask.shape, capture.mask.all()) == ((), (5, 6), True)
-    np.testing.assert_allclose(capture.light_directions, LIGHTS)
+    assert_allclose(capture.light_directions, FOUR_LIGHTS)
     np.savetxt(capture_folder / "light_intensities.txt", INTENSITIES)
     mask = np.random.default_rng(4).random((5, 6)) < 0.5
     write_image("vase/mask.png", mask.astype(np.uint8) * 255)
     normals = np.broadcast_to([0.0, 0.6, 0.8], (5, 6, 3))
     np.save(capture_folder / "normals_gt.npy", normals)
     capture = read_capture(capture_folder)
-    np.testing.assert_array_equal(capture.mask, mask)
-    np.testing.assert_allclose(
+    assert_array_equal(capture.mask, mask)
+    assert_allclose(
         capture.observations, expected(photographs, INTENSITIES)[mask.ravel()], rtol=1e-6
     )
-    np.testing.assert_allclose(capture.ground_truth, normals * mask[..., None], atol=1e-7)
+    assert_allclose(capture.ground_truth, normals * mask[..., None], atol=1e-7)
 
 
-def test_only_the_chosen_images_are_read(
-    capture_folder: Path, photographs: NDArray[np.uint16]
-) -> None:
+def test_only_the_chosen_images_are_read(capture_folder, photographs):
     (capture_folder / "img9.png").write_bytes(b"damaged")
-    calls: list[int] = []
+    calls = []
     source = open_capture(capture_folder)
     assert source.n_lights == 4
     assert [path.name for path in source.files.images] == [
@@ -98,8 +87,8 @@ def test_only_the_chosen_images_are_read(
     capture = prepare_capture(source, [3, 0, 2], advance=lambda *_: calls.append(1))
     assert len(calls) == 3
     assert capture.light_indices == (3, 0, 2)
-    np.testing.assert_allclose(capture.light_directions, LIGHTS[[3, 0, 2]])
-    np.testing.assert_allclose(
+    assert_allclose(capture.light_directions, FOUR_LIGHTS[[3, 0, 2]])
+    assert_allclose(
         capture.observations, expected(photographs[[3, 0, 2]], np.ones((3, 3))), rtol=1e-6
     )
     with pytest.raises(InputError, match=r"img9\.png: found neither PNG, TIFF, .* nor HEIC"):
@@ -112,7 +101,7 @@ def test_dark_pixels_are_kept_and_values_outside_the_mask_ignored(capture_folder
         tifffile.imwrite(capture_folder / f"{number}.tif", np.array([[0, np.nan, 2.5]], np.float32))
     write_image("vase/mask.png", np.array([[1, 0, 1]], np.uint8))
     capture = read_capture(capture_folder)
-    np.testing.assert_array_equal(capture.observations, [[0] * 4, [2.5] * 4])
+    assert_array_equal(capture.observations, [[0] * 4, [2.5] * 4])
     (warning,) = texts(capture.warnings)
     assert (
         warning.startswith("50.0 % of the pixels are black")
@@ -123,7 +112,7 @@ def test_dark_pixels_are_kept_and_values_outside_the_mask_ignored(capture_folder
         read_capture(capture_folder)
 
 
-def test_warnings(capture_folder: Path, write_image: WriteImage) -> None:
+def test_warnings(capture_folder, write_image):
     pixels = np.full((10, 10, 3), 200, np.uint8)
     pixels[0, :5, 1] = 255
     for number in range(8, 12):
@@ -151,14 +140,12 @@ def test_warnings(capture_folder: Path, write_image: WriteImage) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "n_pixels", "mae_deg"),
+    "name, n_pixels, mae_deg",
     [("ballPNG", 15791, 4.29), ("catPNG", 45200, 8.45)],
     # the errors: the README beside the data; 0.02 for their rounding and the light files' four
     # decimals
 )
-def test_least_squares_on_diligent(
-    shared_data: Path, name: str, n_pixels: int, mae_deg: float
-) -> None:
+def test_least_squares_on_diligent(shared_data, name, n_pixels, mae_deg):
     capture = read_capture(shared_data / "DiLiGenT/pmsData" / name, as_stored=True)
     assert (capture.name, capture.observations.shape) == (name, (n_pixels, 96))
     solution = np.linalg.lstsq(
@@ -172,11 +159,9 @@ def test_least_squares_on_diligent(
 
 
 @pytest.mark.parametrize(
-    ("scale", "spread", "warned"), [(1, 0.3, False), (600, 0, False), (200, 0.3, True)]
+    "scale, spread, warned", [(1, 0.3, False), (600, 0, False), (200, 0.3, True)]
 )
-def test_positions_given_as_directions_are_named(
-    tmp_path: Path, scale: float, spread: float, warned: bool
-) -> None:
+def test_positions_given_as_directions_are_named(tmp_path, scale, spread, warned):
     """Vectors of one length, or of about 1, are directions."""
     lights = ring_lights(8) * scale * (1 + spread * np.linspace(0, 1, 8)[:, None])
     folder = write_capture(tmp_path / "a", np.full((8, 4, 5), 100, np.uint8), lights)
@@ -186,22 +171,17 @@ def test_positions_given_as_directions_are_named(
         assert "lengths from 200 to 260" in found[0] and "--light-positions" in found[0]
 
 
-LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
 MASK = np.array([[True, False, True], [True, True, False]])
 
 
-def make(**changes: Any) -> Capture:
-    fields: dict[str, Any] = {
-        "name": "vase",
-        "observations": np.arange(16).reshape(4, 4),
-        "mask": MASK,
-    }
+def make(**changes):
+    fields = {"name": "vase", "observations": np.arange(16).reshape(4, 4), "mask": MASK}
     return Capture(
-        **(fields | {"light_directions": LIGHTS, "light_indices": (0, 1, 2, 7)} | changes)
+        **(fields | {"light_directions": FOUR_LIGHTS, "light_indices": (0, 1, 2, 7)} | changes)
     )
 
 
-def test_positions_that_cannot_be_meant() -> None:
+def test_positions_that_cannot_be_meant():
     for positions, message in (
         ([0, 1, -1], "light index -1 is out of range"),
         ([0, 1, 2, 1], "light index 1 is listed twice. Name each light once."),
@@ -215,7 +195,7 @@ NO_NORMAL = "a ground-truth normal is neither a unit vector nor zero"
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes, message",
     [
         (
             {"observations": np.zeros((5, 4))},
@@ -223,13 +203,16 @@ NO_NORMAL = "a ground-truth normal is neither a unit vector nor zero"
         ),
         ({"observations": np.full((4, 4), np.nan)}, "an observation is not finite"),
         (
-            {"light_directions": LIGHTS[:, :2]},
+            {"light_directions": FOUR_LIGHTS[:, :2]},
             r"light directions of shape \(4, 2\), expected \(F, 3\)",
         ),
         ({"light_indices": (0, 1, 2)}, "3 light indices for 4 lights"),
-        ({"light_directions": LIGHTS * 1.01}, "a light direction is not a unit vector"),
-        ({"light_directions": LIGHTS * np.nan}, "a light direction is not finite"),
-        ({"light_directions": LIGHTS * [1, 1, -1]}, r"light 0 is below the horizon \(z <= 0\)"),
+        ({"light_directions": FOUR_LIGHTS * 1.01}, "a light direction is not a unit vector"),
+        ({"light_directions": FOUR_LIGHTS * np.nan}, "a light direction is not finite"),
+        (
+            {"light_directions": FOUR_LIGHTS * [1, 1, -1]},
+            r"light 0 is below the horizon \(z <= 0\)",
+        ),
         ({"mask": np.zeros((2, 3), bool)}, "the mask is empty"),
         ({"mask": np.ones(4, bool)}, r"a mask of shape \(4,\), expected \(H, W\)"),
         (
@@ -240,19 +223,19 @@ NO_NORMAL = "a ground-truth normal is neither a unit vector nor zero"
         ({"ground_truth": np.full((2, 3, 3), np.nan)}, NO_NORMAL),
     ],
 )
-def test_fields_that_do_not_fit(changes: dict[str, Any], message: str) -> None:
+def test_fields_that_do_not_fit(changes, message):
     with pytest.raises(InputError, match=f"vase: {message}"):
         make(**changes)
 
 
-def test_restored_observations_follow_the_choice() -> None:
+def test_restored_observations_follow_the_choice():
     restored = np.arange(16).reshape(4, 4) % 3 == 0
     capture = make(restored=restored)
-    np.testing.assert_array_equal(capture.choose_lights([3, 0, 2]).restored, restored[:, [3, 0, 2]])
+    assert_array_equal(capture.choose_lights([3, 0, 2]).restored, restored[:, [3, 0, 2]])
     chosen = capture.choose_pixels(np.array([0, 3]))
-    np.testing.assert_array_equal(chosen.restored, restored[[0, 3]])
-    np.testing.assert_array_equal(chosen.observations, capture.observations[[0, 3]])
-    np.testing.assert_array_equal(chosen.mask, [[True, False, False], [False, True, False]])
+    assert_array_equal(chosen.restored, restored[[0, 3]])
+    assert_array_equal(chosen.observations, capture.observations[[0, 3]])
+    assert_array_equal(chosen.mask, [[True, False, False], [False, True, False]])
     assert make().choose_lights([0, 1, 2]).restored is None
     with pytest.raises(
         InputError, match=r"vase: restored flags of shape \(4, 3\), expected .* = \(4, 4\)"
@@ -261,20 +244,20 @@ def test_restored_observations_follow_the_choice() -> None:
 
 
 @pytest.fixture(params=[True, False])
-def stderr_is_apart(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
-    apart: bool = request.param
+def stderr_is_apart(request, monkeypatch):
+    apart = request.param
     monkeypatch.setattr(module, "stderr_is_apart", lambda: apart)
     return apart
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5])
-def test_all_come_in_their_order(stderr_is_apart: bool, count: int) -> None:
+def test_all_come_in_their_order(stderr_is_apart, count):
     assert list(read_ahead(lambda item: 10 * item, range(count))) == [
         10 * item for item in range(count)
     ]
 
 
-def test_the_next_item_is_read_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_next_item_is_read_meanwhile(monkeypatch):
     monkeypatch.setattr(module, "stderr_is_apart", lambda: True)
     begun = [threading.Event() for _ in range(4)]
     for item in (images := read_ahead(lambda item: begun[item].set() or item, range(4))):
@@ -283,7 +266,7 @@ def test_the_next_item_is_read_meanwhile(monkeypatch: pytest.MonkeyPatch) -> Non
     assert next(images, None) is None
 
 
-def test_messages_of_the_command_are_not_caught_with_those_of_the_libraries() -> None:
+def test_messages_of_the_command_are_not_caught_with_those_of_the_libraries():
     script = """
 import os, sys
 from contextlib import redirect_stderr

@@ -3,13 +3,11 @@ then.
 """
 
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from capture.conftest import WriteImage
-from scenes import write_capture
+from scenes import put, write_capture
 from splinecli.capture import (
     CaptureOptions,
     Overrides,
@@ -22,12 +20,10 @@ from splinecli.capture.files import digest
 from splinecli.errors import InputError
 
 
-def fill(folder: Path, names: str) -> Path:
+def fill(folder, names):
     """Make empty files of these names."""
     for name in names.split():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
+        put(folder / name)
     return folder
 
 
@@ -193,7 +189,7 @@ OTHERS = (
 
 
 @pytest.fixture
-def folder(tmp_path: Path, write_image: WriteImage) -> Path:
+def folder(tmp_path, write_image):
     """A capture with every kind of file."""
     write_image("vase/ambient.png", np.full((4, 5), 100, np.uint16))
     write_image("flat.png", np.full((4, 5), 60_000, np.uint16))
@@ -213,7 +209,7 @@ def folder(tmp_path: Path, write_image: WriteImage) -> Path:
     )
 
 
-def stamp(folder: Path) -> str:
+def stamp(folder):
     flat = RadiometricCalibration(flat_field=(folder.parent / "flat.png",))
     return digest(open_capture(folder, CaptureOptions(radiometry=flat)).stamp)
 

@@ -3,12 +3,11 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.testing import assert_allclose
 
 from splinecli.capture import CaptureOptions, open_capture
 from splinecli.capture.linearise import Window, parse_window
@@ -19,23 +18,23 @@ from splinecli.maths.pixel_grid import pixel_rays
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions, InfoOptions
 from splinecli.pipeline.info import describe_capture
-from splinecli.recipe import RecipeOptions, prepare_capture
+from splinecli.recipe import RecipeOptions, prepare_capture, read_capture
 
 MEDALLION = Path(__file__).parents[2] / "examples/medallion"
 WINDOWS = [("31,22,50,47", None), (None, "1/3"), ("31,22,50,47", "1/4")]
 
 
-def on_image(mask: NDArray[np.bool_], values: NDArray[Any]) -> NDArray[Any]:
+def on_image(mask, values):
     """Return the map (H, W, C) of the values (P, C) of a mask (H, W)."""
     image = np.zeros((*mask.shape, *values.shape[1:]), values.dtype)
     image[mask] = values
     return image
 
 
-@pytest.mark.parametrize(("crop", "scale"), WINDOWS)
-def test_a_window_reads_a_part_of_the_whole(crop: str | None, scale: str | None) -> None:
+@pytest.mark.parametrize("crop, scale", WINDOWS)
+def test_a_window_reads_a_part_of_the_whole(crop, scale):
     window = parse_window(crop, scale)
-    whole = prepare_capture(open_capture(MEDALLION), options=RecipeOptions(as_stored=True))
+    whole = read_capture(MEDALLION, as_stored=True)
     part = prepare_capture(
         open_capture(MEDALLION, CaptureOptions(window=window)),
         options=RecipeOptions(as_stored=True),
@@ -44,14 +43,14 @@ def test_a_window_reads_a_part_of_the_whole(crop: str | None, scale: str | None)
     np.testing.assert_array_equal(part.ground_truth, window.of(whole.ground_truth))
     # Sums over the colours may round differently.
     expected = window.of(on_image(whole.mask, whole.observations))[part.mask]
-    np.testing.assert_allclose(part.observations, expected, rtol=1e-6)
+    assert_allclose(part.observations, expected, rtol=1e-6)
     described = describe_capture(
         InfoOptions(capture=MEDALLION), InferOptions(crop=crop, scale=scale)
     )
     assert (described["n_pixels"], described["reads"]) == (part.n_pixels, window.in_words())
 
 
-def test_ambient_and_flat_field_are_read_in_the_window(tmp_path: Path) -> None:
+def test_ambient_and_flat_field_are_read_in_the_window(tmp_path):
     """Both change from pixel to pixel, so other pixels of them would give other observations."""
     folder = tmp_path / "capture"
     shutil.copytree(MEDALLION, folder)
@@ -69,13 +68,11 @@ def test_ambient_and_flat_field_are_read_in_the_window(tmp_path: Path) -> None:
     part = parse_window(*WINDOWS[2]).of(maps[0])
     # The flat field is divided by its mean over the pixels that are read.
     ratio = maps[1][part > 0] / part[part > 0]
-    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-4)
+    assert_allclose(ratio, ratio[0], rtol=1e-4)
 
 
-@pytest.mark.parametrize(("crop", "scale"), WINDOWS)
-def test_results_are_a_part_of_those_of_the_whole(
-    crop: str | None, scale: str | None, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("crop, scale", WINDOWS)
+def test_results_are_a_part_of_those_of_the_whole(crop, scale, tmp_path):
     maps = {}
     for name, options in (("whole", (None, None)), ("part", (crop, scale))):
         crop_and_scale = dict(zip(("crop", "scale"), options, strict=True))
@@ -87,10 +84,10 @@ def test_results_are_a_part_of_those_of_the_whole(
         folder = tmp_path / name / "medallion"
         maps[name] = np.load(folder / "normals.npy"), np.load(folder / "albedo.npy")
     for whole, part in zip(maps["whole"], maps["part"], strict=True):
-        np.testing.assert_allclose(part, parse_window(crop, scale).of(whole), atol=1e-5)
+        assert_allclose(part, parse_window(crop, scale).of(whole), atol=1e-5)
 
 
-def test_windows_in_words() -> None:
+def test_windows_in_words():
     assert (
         parse_window(*WINDOWS[2]).in_words()
         == "50 x 47 pixels from (31, 22), one of 4 rows and columns"
@@ -99,7 +96,7 @@ def test_windows_in_words() -> None:
 
 
 @pytest.mark.parametrize(
-    ("crop", "scale", "problem"),
+    "crop, scale, problem",
     [
         ("1,2,3", None, "--crop is '1,2,3'; expected X,Y,W,H"),
         ("-1,0,5,5", None, "--crop is"),
@@ -109,14 +106,12 @@ def test_windows_in_words() -> None:
         (None, "0.5", "--scale is"),
     ],
 )
-def test_values_that_mean_nothing_are_refused(
-    crop: str | None, scale: str | None, problem: str
-) -> None:
+def test_values_that_mean_nothing_are_refused(crop, scale, problem):
     with pytest.raises(UsageError, match=problem):
         InferOptions(crop=crop, scale=scale)
 
 
-def test_windows_that_do_not_fit_are_refused() -> None:
+def test_windows_that_do_not_fit_are_refused():
     with pytest.raises(InputError, match="--crop 0,0,5000,5 is not inside the image of"):
         open_capture(MEDALLION, CaptureOptions(window=parse_window("0,0,5000,5", None)))
     with pytest.raises(InputError, match="no pixel in the part that is read"):
@@ -125,8 +120,8 @@ def test_windows_that_do_not_fit_are_refused() -> None:
         )
 
 
-@pytest.mark.parametrize(("crop", "scale"), WINDOWS)
-@pytest.mark.parametrize(("near", "perspective"), [(True, False), (True, True), (False, True)])
+@pytest.mark.parametrize("crop, scale", WINDOWS)
+@pytest.mark.parametrize("near, perspective", [(True, False), (True, True), (False, True)])
 def test_a_part_is_lit_and_seen_as_in_the_whole(crop, scale, near, perspective, tmp_path):
     """Under near lamps, and by a near camera."""
     matrix = tmp_path / "camera.txt"
@@ -150,10 +145,10 @@ def test_a_part_is_lit_and_seen_as_in_the_whole(crop, scale, near, perspective, 
         )
         images.append(on_image(capture.mask, np.concatenate(values, axis=1)))
     whole, part = images
-    np.testing.assert_allclose(part, parse_window(crop, scale).of(whole), rtol=1e-4, atol=1e-5)
+    assert_allclose(part, parse_window(crop, scale).of(whole), rtol=1e-4, atol=1e-5)
 
 
-def test_the_width_of_a_part_is_not_that_of_the_object() -> None:
+def test_the_width_of_a_part_is_not_that_of_the_object():
     options = InferOptions(crop="31,22,50,47", light_distance=400.0, object_width=10.0)
     with pytest.raises(SplinecliError, match="--object-width needs the whole object in the image"):
         options.open(MEDALLION)
@@ -164,11 +159,11 @@ def test_the_width_of_a_part_is_not_that_of_the_object() -> None:
     assert narrow.lamps.pixel_size == pytest.approx(3 * wide.lamps.pixel_size, rel=0.03)
 
 
-def test_the_camera_of_the_part_sees_the_same_rays() -> None:
+def test_the_camera_of_the_part_sees_the_same_rays():
     window, matrix = (
         Window((2, 1, 5, 4), 2, (7, 9)),
         np.array([(90, 1, 3.5), (0, 80, 2.5), (0, 0, 1)]),
     )
     whole = pixel_rays(np.ones((7, 9), np.bool_), matrix).reshape(7, 9, 3)
     part = pixel_rays(np.ones((2, 3), np.bool_), window.camera(matrix)).reshape(2, 3, 3)
-    np.testing.assert_allclose(part, window.of(whole), atol=1e-12)
+    assert_allclose(part, window.of(whole), atol=1e-12)

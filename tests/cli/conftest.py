@@ -6,10 +6,9 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -37,12 +36,12 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples/medallion"
 
 
 @pytest.fixture(autouse=True)
-def in_own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def in_own_folder(tmp_path, monkeypatch):
     """Let relative paths begin in a new folder, so that messages hold short paths."""
     monkeypatch.chdir(tmp_path)
 
 
-def sphere_normals() -> np.ndarray:
+def sphere_normals():
     """Normals (SIZE, SIZE, 3) of the upper part of a matte sphere, which no light above leaves in
     shadow.
     """
@@ -50,7 +49,7 @@ def sphere_normals() -> np.ndarray:
     return unit(np.stack((x, y, np.full_like(x, 2.5)), axis=-1))
 
 
-def write_capture(folder: Path) -> Path:
+def write_capture(folder):
     """A capture with ground truth; its disc-shaped mask has 448 of 576 pixels."""
     normals, lights = sphere_normals(), unit(LIGHTS)
     pictures = to_uint16(np.moveaxis(normals @ lights.T, 2, 0) * 60_000)
@@ -62,30 +61,30 @@ def write_capture(folder: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def truth() -> np.ndarray:
+def truth():
     """True normals (SIZE, SIZE, 3) of the capture."""
     return sphere_normals()
 
 
 @pytest.fixture
-def make_capture() -> Callable[[str], Path]:
+def make_capture():
     """Write captures by name into the working folder."""
     return lambda name: write_capture(Path(name))
 
 
 @pytest.fixture
-def capture(make_capture: Callable[[str], Path]) -> Path:
+def capture(make_capture):
     """The capture `sphere` in the working folder."""
     return make_capture("sphere")
 
 
 @pytest.fixture
-def medallion() -> Path:
+def medallion():
     """A copy of the example, in an empty working folder."""
     return Path(shutil.copytree(EXAMPLE, "medallion"))
 
 
-def read_report(folder: Path) -> dict:
+def read_report(folder):
     return read_json(folder / "report.json")
 
 
@@ -94,61 +93,80 @@ class Run(NamedTuple):
     out: str
     err: str
 
+    @property
+    def json(self):
+        return json.loads(self.out)
+
+
+def table(text: str) -> list[tuple[str, ...]]:
+    """The cells of a table whose lines have | between them."""
+    return [tuple(map(str.strip, line.split("|"))) for line in text.strip().splitlines()]
+
 
 COMMAND = cache(typer.main.get_command)
 """The commands are the same in all tests. Making them takes longer than many a command."""
 
 
+def checked(result, code, says):
+    """The result, whose exit code and messages must be these."""
+    assert result.code in (code if isinstance(code, tuple) else (code,)), result
+    for text in (says,) if isinstance(says, str) else says:
+        assert text in result.err
+    return result
+
+
 @pytest.fixture
-def run(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Run]:
-    """Run the command line: run("infer", folder, "--json") -> Run(code, out, err)."""
+def run(capfd, monkeypatch):
+    """Run the command line: run("infer sphere --json", "a name with spaces") -> Run.
+
+    The exit code must be `code`, stdout `out` and stderr `err`, where given, with `says` in stderr.
+    """
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.setenv("TERMINAL_WIDTH", "100")
     monkeypatch.setattr(typer.main, "get_command", COMMAND)
 
-    def call(*args: object) -> Run:
-        code = main([str(arg) for arg in args])
-        return Run(code, *capfd.readouterr())
+    def call(command, *more, code=0, says=(), out=None, err=None):
+        found = main([*command.split(), *map(str, more)])
+        result = checked(Run(found, *capfd.readouterr()), code, says)
+        assert out in (None, result.out) and err in (None, result.err), result
+        return result
 
     return call
 
 
 @pytest.fixture
-def document(run: Callable[..., Run]) -> Callable[..., Any]:
+def document(run):
     """Run a command with --json, which must succeed, and return its document: that of the only
     capture of `infer`.
     """
 
-    def call(command: str, *args: object) -> Any:
-        result = run(command, *args, "--json")
-        assert result.code == 0, result.err
-        found = json.loads(result.out)
-        return found[0] if command == "infer" else found
+    def call(command, *more):
+        found = run(f"{command} --json", *more).json
+        return found[0] if command.startswith("infer") else found
 
     return call
 
 
 @pytest.fixture
-def refuse(run: Callable[..., Run], golden: Callable[[str, str], None]) -> Callable[..., None]:
-    """Run a command with arguments that it must refuse, (exit code, arguments), and compare all its
-    messages.
+def refuse(run, golden):
+    """Run a command that must refuse the arguments of each line, behind their exit code, and
+    compare all its messages.
     """
 
-    def check(command: str, cases: Iterable[tuple[int, list[object]]], name: str) -> None:
+    def check(command, cases):
         messages = []
-        for code, arguments in cases:
-            result = run(command, *arguments)
-            assert (result.code, result.out) == (code, ""), (arguments, result.err)
+        for code, arguments in re.findall(r"^ *(\d) ?(.*)$", cases, re.MULTILINE):
+            result = run(f"{command} {arguments}", code=int(code), out="")
             messages.append(
                 re.sub("[0-9a-f]{16}", "<checksum>", result.err.replace(f"{Path.cwd()}/", ""))
             )
-        golden(name, "".join(messages))
+        golden(f"{command.replace('-', '_')}_refusals.txt", "".join(messages))
 
     return check
 
 
 @pytest.fixture
-def run_without_privileges() -> Callable[..., Run]:
+def run_without_privileges():
     """Run the command line in a process that permissions bind, also where the tests run as root."""
     command = [sys.executable, "-m", "splinecli"]
     if os.name == "nt":
@@ -159,8 +177,8 @@ def run_without_privileges() -> Callable[..., Run]:
         rights = "-dac_override,-dac_read_search"
         command = ["setpriv", f"--bounding-set={rights}", f"--inh-caps={rights}", *command]
 
-    def call(*args: object) -> Run:
-        done = subprocess.run([*command, *map(str, args)], capture_output=True, text=True)
-        return Run(done.returncode, done.stdout, done.stderr)
+    def call(words, *more, code):
+        done = subprocess.run([*command, *words.split(), *more], capture_output=True, text=True)
+        return checked(Run(done.returncode, done.stdout, done.stderr), code, ())
 
     return call

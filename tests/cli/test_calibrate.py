@@ -1,6 +1,5 @@
 """`splinecli calibrate`: its files, messages and errors, on synthetic mirror balls."""
 
-import json
 from pathlib import Path
 
 import cv2
@@ -20,7 +19,7 @@ def normals():
     return np.stack((nx, ny, np.sqrt(np.where(inside, 1 - nx**2 - ny**2, 0))), axis=-1), inside
 
 
-def write_balls(folder: Path, lights=LIGHTS, *, wall: float = 0.2) -> Path:
+def write_balls(folder, lights=LIGHTS, *, wall=0.2):
     """Write images of a ball that shows each lamp as a soft spot, where the normal halves view and
     light.
     """
@@ -33,7 +32,7 @@ def write_balls(folder: Path, lights=LIGHTS, *, wall: float = 0.2) -> Path:
     return folder
 
 
-def write_gray(folder: Path, intensities) -> Path:
+def write_gray(folder, intensities):
     n, inside = normals()
     images = (
         0.5
@@ -50,10 +49,12 @@ def angles_deg(found, expected=LIGHTS):
 
 def test_one_ball(run):
     write_balls(Path("ball"))
-    result = run("calibrate", "ball")
-    assert (result.code, result.out) == (0, "calibration/light_directions.txt\n")
+    result = run(
+        "calibrate ball",
+        says="from picture, 100 % of the outline visible",
+        out="calibration/light_directions.txt\n",
+    )
     assert result.err.startswith("ball: circle 60.")
-    assert "from picture, 100 % of the outline visible" in result.err
     assert angles_deg(read_light_directions("calibration/light_directions.txt", 4)).max() < 1.5
     height, width, _ = cv2.imread("calibration/calibration.png").shape
     assert 200 < height < 240 and width == 800, "four images of 200 pixels under their title"
@@ -62,7 +63,7 @@ def test_one_ball(run):
 
 def test_an_outline_given_by_the_user(document):
     write_balls(Path("ball"))
-    report = document("calibrate", "ball", "--circle", "60,48,40", "-o", "out")
+    report = document("calibrate ball --circle 60,48,40 -o out")
     assert report["balls"][0]["circle"] == {
         "x": 60.0,
         "y": 48.0,
@@ -82,41 +83,37 @@ def test_positions_need_the_camera(run):
         for path in write_balls(Path(name)).iterdir():
             picture = read_image(path)
             write_image(path, np.pad(picture, ((0, 0), pads), constant_values=13107))
-    circles = ["--circle", "60,48,40", "--circle", "240,48,40"]
-    result = run("calibrate", "one", "two", *circles)
-    assert "the lamps' distances are unknown: they are treated as distant" in result.err
-    assert "warning: The lamps' distances are unknown, because the camera is" in result.err
+    circles = "--circle 60,48,40 --circle 240,48,40"
+    result = run(
+        f"calibrate one two {circles}",
+        says=(
+            "the lamps' distances are unknown: they are treated as distant",
+            "warning: The lamps' distances are unknown, because the camera is",
+        ),
+    )
     assert not Path("calibration/light_positions.txt").exists()
     matrix = np.array(((1000, 0, 149.5), (0, 1000, 49.5), (0, 0, 1)))
     np.savetxt("matrix.txt", matrix)
-    arguments = [
-        "calibrate",
-        "one",
-        "two",
-        *circles,
-        "--overwrite",
-        "--json",
-        "--camera-matrix",
-        "matrix.txt",
-    ]
-    report = json.loads(run(*arguments).out)
+    arguments = f"calibrate one two {circles} --overwrite --json --camera-matrix matrix.txt"
+    report = run(arguments).json
     assert report["camera"] == {"from": "--camera-matrix", "matrix": matrix.tolist()}
     known = report["lamp_positions"]["known"]
     for name in ("light_positions.txt", "pixel_size.txt", "camera_matrix.txt"):
         assert Path("calibration", name).exists() == known
     Path("matrix.txt").write_text("900 0\n0 900\n")
-    result = run(*arguments)
-    assert result.code == 3 and "matrix.txt: found 2 x 2 numbers, expected 3 x 3" in result.out
+    result = run(arguments, code=3)
+    assert "matrix.txt: found 2 x 2 numbers, expected 3 x 3" in result.out
 
 
 def test_the_normals_are_not_the_lights(run):
     write_balls(Path("ball"))
     np.savetxt("mistake.txt", halfway(LIGHTS))
-    result = run("calibrate", "ball", "--circle", "60,48,40", "--compare", "mistake.txt")
-    assert result.code == 0 and "the compared file differs by 13." in result.err
-    assert (
-        "warning: The compared file contains the normals of the ball at the highlights"
-        in result.err
+    run(
+        "calibrate ball --circle 60,48,40 --compare mistake.txt",
+        says=(
+            "the compared file differs by 13.",
+            "warning: The compared file contains the normals of the ball at the highlights",
+        ),
     )
 
 
@@ -125,8 +122,10 @@ def test_an_uncertain_outline(run):
     mask = normals()[1].astype(np.uint8) * 255
     mask[:48] = 0
     cv2.imwrite("half.png", mask)
-    result = run("calibrate", "one", "--mask", "half.png", "-o", "half")
-    assert result.code == 0 and "warning: one: the outline of the ball is uncertain (" in result.err
+    run(
+        "calibrate one --mask half.png -o half",
+        says="warning: one: the outline of the ball is uncertain (",
+    )
 
 
 def test_refusals(refuse):
@@ -142,26 +141,26 @@ def test_refusals(refuse):
     Path("empty").mkdir()
     Path("done").mkdir()
     Path("done/calibration.png").touch()
-    cases = (
-        (2, []),
-        (2, ["ball", "--circle", "60,48"]),
-        (2, ["ball", "--circle", "60,48,-3"]),
-        (2, ["ball", "short", "--circle", "60,48,40"]),
-        (2, ["ball", "--gray-ball", "gray", "--gray-card", "gray"]),
-        (3, ["missing"]),
-        (3, ["empty"]),
-        (3, ["flat"]),
-        (3, ["cut"]),
-        (3, ["dark", "--circle", "60,48,40"]),
-        (3, ["ball", "--circle", "600,480,40"]),
-        (3, ["ball", "short", "--circle", "60,48,40", "--circle", "60,48,40"]),
-        (3, ["ball", "--mask", "missing.png"]),
-        (3, ["ball", "--circle", "60,48,40", "--gray-ball", "gray"]),
-        (3, ["ball", "--circle", "60,48,40", "--gray-card", "short"]),
-        (3, ["ball", "--circle", "60,48,40", "--compare", "missing.txt"]),
-        (5, ["ball", "-o", "done"]),
-    )
-    refuse("calibrate", cases, "calibrate_refusals.txt")
+    cases = """
+        2
+        2 ball --circle 60,48
+        2 ball --circle 60,48,-3
+        2 ball short --circle 60,48,40
+        2 ball --gray-ball gray --gray-card gray
+        3 missing
+        3 empty
+        3 flat
+        3 cut
+        3 dark --circle 60,48,40
+        3 ball --circle 600,480,40
+        3 ball short --circle 60,48,40 --circle 60,48,40
+        3 ball --mask missing.png
+        3 ball --circle 60,48,40 --gray-ball gray
+        3 ball --circle 60,48,40 --gray-card short
+        3 ball --circle 60,48,40 --compare missing.txt
+        5 ball -o done
+    """
+    refuse("calibrate", cases)
     assert not Path("calibration").exists()
 
 
@@ -172,17 +171,17 @@ def test_a_display_encoded_target_is_reported(run):
         picture = read_image(path)
         write_image(path.with_suffix(".jpg"), (picture // 257).astype(np.uint8))
         path.unlink()
-    arguments = ["calibrate", "ball", "--circle", "60,48,40", "--gray-ball", "gray", "--overwrite"]
-    asked = run(*arguments, "--transfer", "linear").err  # the option that the warning below names
+    arguments = "calibrate ball --circle 60,48,40 --gray-ball gray --overwrite"
+    asked = run(f"{arguments} --transfer linear").err  # the option that the warning below names
     assert "as --transfer says. Leave it out if" in asked and "Add --transfer" not in asked
     intensities = []
     for curve in ("srgb", "auto"):
-        run(*arguments, "--transfer", curve)
+        run(f"{arguments} --transfer {curve}")
         intensities.append(Path("calibration/light_intensities.txt").read_text())
     assert intensities[0] == intensities[1]
-    assert "are read as sRGB. Add --transfer linear" in run(*arguments).err
-    assert "--transfer srgb reverses" not in run(*arguments, "--transfer", "srgb").err
-    assert "The light intensities are in calibration/light_intensities.txt\n" in run(*arguments).err
+    run(arguments, says="are read as sRGB. Add --transfer linear")
+    assert "--transfer srgb reverses" not in run(f"{arguments} --transfer srgb").err
+    run(arguments, says="The light intensities are in calibration/light_intensities.txt\n")
     # Those of earlier lights are removed.
-    assert run("calibrate", "ball", "--overwrite").code == 0
+    run("calibrate ball --overwrite")
     assert not Path("calibration/light_intensities.txt").exists()

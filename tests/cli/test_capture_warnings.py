@@ -2,16 +2,15 @@
 `info`.
 """
 
-import json
 import shutil
 import warnings
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 import splinecli
+from cli.conftest import read_report
 from scenes import (
     read_image,
     read_json,
@@ -26,22 +25,21 @@ from splinecli.judge import checks
 from test_notebook import read_medallion
 
 
-def move(path: Path, right: int, down: int) -> None:
+def move(path, right, down):
     picture = read_image(path)
     write_image(path, np.roll(picture, (down, right), axis=(0, 1)))
 
 
-def codes() -> list[str]:
+def codes():
     report = read_json("out/medallion/report.json")
     return [warning["code"] for warning in report["warnings"]]
 
 
-def refused(run, *command: object) -> str:
+def refused(run, command=""):
     """Run infer with --strict, which must refuse the capture and write nothing;
     return the message.
     """
-    result = run("infer", "medallion", *command, "--strict", "-o", "refused")
-    assert (result.code, result.out) == (3, "")
+    result = run(f"infer medallion --strict -o refused {command}", code=3, out="")
     assert not Path("refused/medallion").exists()
     return result.err
 
@@ -53,18 +51,16 @@ def test_shifted_images_are_named(run, medallion):
         "2 of 10 images are shifted against the others, in pixels: 04.png 2 right 1 up, 09.png 4"
         " down."
     )
-    result = run("infer", medallion, "--method", "ls")
-    assert result.code == 0 and words in result.err and "The images were aligned to" in result.err
-    aligned = json.loads(Path("out/medallion/report.json").read_text("utf-8"))
+    run(f"infer {medallion} --method ls", says=(words, "The images were aligned to"))
+    aligned = read_report(Path("out/medallion"))
     assert aligned["mended"] == ["images_shifted"]
-    run("infer", medallion, "--method", "ls", "--as-stored", "--overwrite")
-    stored = json.loads(Path("out/medallion/report.json").read_text("utf-8"))
-    assert stored["mended"] == []
+    run(f"infer {medallion} --method ls --as-stored --overwrite")
+    stored = read_report(Path("out/medallion"))
+    assert (stored["mended"], codes()) == ([], ["images_shifted"])
     assert aligned["angular_error_deg"]["mean"] < stored["angular_error_deg"]["mean"]
-    assert "images_shifted" in codes()
-    info = run("info", medallion, "--json")
-    assert words in info.err and "images_aligned" in json.loads(info.out)["warning_codes"]
-    assert words.removesuffix(".") in refused(run, "--method", "ls")
+    info = run(f"info {medallion} --json", says=words)
+    assert "images_aligned" in info.json["warning_codes"]
+    assert words.removesuffix(".") in refused(run, "--method ls")
 
 
 def test_the_same_file_under_two_lights(run, medallion):
@@ -73,33 +69,31 @@ def test_the_same_file_under_two_lights(run, medallion):
     """
     for copy, original in (("02", "01"), ("07", "03")):
         shutil.copy(medallion / f"{original}.png", medallion / f"{copy}.png")
-    result = run("infer", medallion, "--method", "ls")
     words = (
         "01.png and 02.png are the same image (and 1 more pair), but their lights differ. Remove"
         " one,"
     )
-    assert result.code == 0 and words in result.err
+    run(f"infer {medallion} --method ls", says=words)
     assert codes() == ["repeated_images"]
-    assert words.removesuffix(" Remove one,") in refused(run, "--method", "ls")
+    assert words.removesuffix(" Remove one,") in refused(run, "--method ls")
 
 
 @pytest.mark.parametrize(
-    ("signs", "negated", "code"),
+    "signs, negated, code",
     [((1, 1, -1), "z", "ground_truth_z"), ((1, -1, 1), "y", "ground_truth_frame")],
 )
 def test_ground_truth_in_another_frame(run, medallion, signs, negated, code):
     (medallion / "normals_gt.png").rename("truth.png")
-    picture = cv2.imread("truth.png", cv2.IMREAD_UNCHANGED)[..., ::-1]
+    picture = read_image("truth.png")[..., ::-1]
     normals = picture / np.iinfo(picture.dtype).max * 2 - 1
     np.save(medallion / "normals_gt.npy", normals * signs)
-    result = run("infer", medallion, "--method", "ls")
-    assert (
-        result.code == 0
-        and f"degrees with {negated} negated: it is probably in this frame" in result.err
+    run(
+        f"infer {medallion} --method ls",
+        says=f"degrees with {negated} negated: it is probably in this frame",
     )
     assert codes() == [code]
-    assert f"with {negated} negated" in refused(run, "--method", "ls")
-    evaluation = run("evaluate", medallion, "--method", "ls", "--n-lights", 8, "--trials", 1)
+    assert f"with {negated} negated" in refused(run, "--method ls")
+    evaluation = run(f"evaluate {medallion} --method ls --n-lights 8 --trials 1")
     assert (
         f"degrees with {negated} negated: it is probably in this frame"
         in evaluation.out + evaluation.err
@@ -113,8 +107,8 @@ def test_lights_that_crowd(run, medallion):
         ((1, 0.05, 1), "are nearly in one plane"),
     ):
         np.savetxt(medallion / "light_directions.txt", given * change)
-        assert f"All lights {words}" in run("info", medallion).err
-    run("infer", medallion, "--method", "ls")
+        run(f"info {medallion}", says=f"All lights {words}")
+    run(f"infer {medallion} --method ls")
     assert "lights_ill_conditioned" in codes()
 
 
@@ -130,8 +124,7 @@ def test_images_of_which_the_network_makes_little(run, medallion, monkeypatch):
     mask = np.zeros(shape[:2], np.uint8)
     mask[60:68, 60:68] = 255
     write_image(medallion / "mask.png", mask)
-    result = run("infer", medallion)
-    assert result.code == 0 and "of the normals to be within 5 degrees" in result.err
+    run(f"infer {medallion}", says="of the normals to be within 5 degrees")
     assert "low_confidence" in codes()
     assert "of the normals to be within 5 degrees" in refused(run)
 
@@ -160,7 +153,7 @@ def test_python_gives_the_same_warnings(medallion):
 LIGHTS = spiral_lights(10, 55, 12)
 
 
-def ball(*, background: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def ball(*, background=0.0):
     """Images (F, H, W) from 0 to 1 of a ball before a plane of this brightness, and its mask."""
     normals, mask = sphere(80)
     normals, mask = (  # type: ignore[assignment]
@@ -174,14 +167,12 @@ def ball(*, background: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     return np.moveaxis(images, 2, 0), mask
 
 
-def stored(images: np.ndarray, full_scale: int = 65_535) -> np.ndarray:
+def stored(images, full_scale=65_535):
     return to_uint16(images * full_scale)
 
 
-def codes_of(run, *command: object) -> list[str]:
-    result = run("info", *command, "--json")
-    assert result.code == 0
-    return json.loads(result.out)["warning_codes"]
+def codes_of(run, command):
+    return run(f"info --json {command}").json["warning_codes"]
 
 
 @pytest.mark.parametrize("background", [0.0, 0.6])
@@ -192,8 +183,11 @@ def test_an_inverted_mask(run, background):
     assert codes_of(run, right) == []
     found = codes_of(run, wrong)
     assert "mask_inverted" in found and "dark_images" not in found
-    result = run("infer", wrong, "--method", "ls", "--strict")
-    assert result.code == 3 and "mask.png excludes a bright area in the middle" in result.err
+    run(
+        f"infer {wrong} --method ls --strict",
+        code=3,
+        says="mask.png excludes a bright area in the middle",
+    )
 
 
 def test_a_mask_around_a_dark_hole_is_right(run):
@@ -207,13 +201,12 @@ def test_a_mask_around_a_dark_hole_is_right(run):
 def test_twelve_bits_in_files_of_sixteen(run):
     images, mask = ball()
     folder = write_capture(Path("twelve"), stored(images, 4095), LIGHTS, mask=mask)
-    result = run("info", folder, "--json")
-    assert json.loads(result.out)["warning_codes"] == ["white_level"]
-    assert (
-        "as from a camera of 12 bits in 16-bit files" in result.err
-        and "--white-level 4095" in result.err
+    result = run(
+        f"info {folder} --json",
+        says=("as from a camera of 12 bits in 16-bit files", "--white-level 4095"),
     )
-    assert codes_of(run, folder, "--white-level", 4095) == []
+    assert result.json["warning_codes"] == ["white_level"]
+    assert codes_of(run, f"{folder} --white-level 4095") == []
 
 
 def test_dark_values_of_sixteen_bits_are_dark(run):
@@ -230,10 +223,10 @@ def test_one_file_of_another_scale(run, others):
     values[4] = stored(images[4], 65_535 if others else 4095)
     folder = write_capture(Path("mixed"), values, LIGHTS, mask=mask)
     assert "image_scale" in codes_of(run, folder)
-    result = run("infer", folder, "--method", "ls", "--strict")
-    assert (
-        result.code == 3
-        and "004.png is 16 times " + ("brighter" if others else "darker") in result.err
+    run(
+        f"infer {folder} --method ls --strict",
+        code=3,
+        says="004.png is 16 times " + ("brighter" if others else "darker"),
     )
     picture = read_image(folder / "004.png")
     write_image(folder / "004.png", picture // 16 if others else picture * np.uint16(16))

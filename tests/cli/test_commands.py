@@ -4,7 +4,6 @@ that sleep.
 
 import contextlib
 import errno
-import json
 import os
 import subprocess
 import sys
@@ -32,16 +31,16 @@ def test_every_option_stands_in_a_panel():
 def test_home_folders_are_expanded(capture, run, monkeypatch):
     monkeypatch.setenv("HOME", str(capture.parent.absolute()))
     monkeypatch.setenv("USERPROFILE", str(capture.parent.absolute()))
-    call = ("infer", "~/sphere", "--lights=~/sphere/light_directions.txt", "--output=~/results")
-    assert run(*call, "--method", "ls").code == 0
+    call = "infer ~/sphere --lights=~/sphere/light_directions.txt --output=~/results"
+    run(f"{call} --method ls")
     assert Path("results/sphere/report.json").is_file()
-    assert run("info", "~/sphere", "--mask=~/sphere/mask.png", "--plot=~/sky.png").code == 0
+    run("info ~/sphere --mask=~/sphere/mask.png --plot=~/sky.png")
     assert Path("sky.png").is_file()
-    assert run("integrate", "~/results/sphere", "--output=~/surface", "--format", "npy").code == 0
+    run("integrate ~/results/sphere --output=~/surface --format npy")
     assert Path("surface/depth.npy").is_file()
-    assert "sphere/light_directions.txt" in run("calibrate", "~/sphere/light_directions.txt").err
+    run("calibrate ~/sphere/light_directions.txt", code=3, says="sphere/light_directions.txt")
     # The weights are a name or a file.
-    missing = run("infer", "~/sphere", "--weights=~/none.safetensors", "--output=~/others").err
+    missing = run("infer ~/sphere --weights=~/none.safetensors --output=~/others", code=4).err
     assert str(capture.parent.absolute() / "none.safetensors") in missing
     assert not Path("~").exists()
 
@@ -87,9 +86,10 @@ def test_a_failure_is_a_json_document(name, wrong, run):
     """
     missing = wrong == "nowhere"
     result = run(
-        name, "--json", *wrong.split(), *(("-o", "set") if missing and name == "prepare" else ())
+        f"{name} --json {wrong} {'-o set' if missing and name == 'prepare' else ''}",
+        code=3 if missing else 2,
     )
-    document = json.loads(result.out)
+    document = result.json
     if name == "infer":
         (document,) = document
     if name == "infer" or (missing and name == "integrate"):
@@ -100,32 +100,27 @@ def test_a_failure_is_a_json_document(name, wrong, run):
         "error": result.err.removeprefix("splinecli: ").rstrip("\n"),
         "exit_code": result.code,
     }
-    assert (result.code, result.err.count("\n"), "nowhere" in result.err) == (
-        3 if missing else 2,
-        1,
-        missing,
-    )
-    assert run(name, "--magic").out == ""
+    assert (result.err.count("\n"), "nowhere" in result.err) == (1, missing)
+    assert run(f"{name} --magic", code=2).out == ""
 
 
-@pytest.mark.parametrize(("command", "skipped"), [("evaluate", "capture"), ("prepare", "source")])
+@pytest.mark.parametrize("command, skipped", [("evaluate", "capture"), ("prepare", "source")])
 def test_a_subfolder_without_permission_is_skipped(
     command, skipped, make_capture, run_without_privileges
 ):
     for name in ("set/a", "set/b", "set/c"):
         make_capture(name)
     Path("set/b").chmod(0)
-    extra = ("--method", "ls", "--trials", 1, "--n-lights", 4) if command == "evaluate" else ()
-    result = run_without_privileges(command, "set", *extra, "-o", "out", "--json")
+    extra = "--method ls --trials 1 --n-lights 4" if command == "evaluate" else ""
+    result = run_without_privileges(f"{command} set -o out --json {extra}", code=3)
     Path("set/b").chmod(0o755)
-    (entry,) = json.loads(result.out)["skipped"]
-    assert (result.code, Path(entry[skipped]).name) == (3, "b")
+    (entry,) = result.json["skipped"]
+    assert Path(entry[skipped]).name == "b" and entry["reason"] in result.err
     assert "set/b: the folder cannot be read (Permission denied)" in entry["reason"]
-    assert entry["reason"] in result.err
 
 
 @pytest.mark.parametrize(
-    ("variables", "expected"),
+    "variables, expected",
     [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active"), ({"GOMP_SPINCOUNT": "9"}, None)],
 )
 def test_waiting_threads_sleep_unless_the_user_says_otherwise(variables, expected):
@@ -144,7 +139,7 @@ def test_waiting_threads_sleep_unless_the_user_says_otherwise(variables, expecte
 
 
 @pytest.mark.parametrize(
-    ("error", "expected"),
+    "error, expected",
     [
         (
             PermissionError(errno.EACCES, "Permission denied", "lights.txt"),

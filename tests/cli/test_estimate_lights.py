@@ -10,14 +10,14 @@ import pytest
 
 from capture.formats.test_film import path_of_lamp, sphere_film, write_film
 from cli.test_schema import check
-from scenes import cap_directions, shade, sphere, write_capture
+from scenes import cap_directions, codes, shade, sphere, write_capture
 from splinecli.maths.normals import angle_between_deg
 
 LIGHTS = cap_directions(10, 50, 4, even=True)
 
 
 @pytest.fixture
-def unlit() -> Path:
+def unlit():
     """A matte sphere without a light file, `ball` in the working folder."""
     normals, inside = sphere(64)
     images = shade(normals, LIGHTS, noise=0.002) * inside[..., None]
@@ -27,10 +27,10 @@ def unlit() -> Path:
 
 
 def test_infer(unlit, run, document):
-    report = document("infer", unlit, "--lights", "estimate", "--method", "ls", "--html")
+    report = document(f"infer {unlit} --lights estimate --method ls --html")
     check(report, "Report")
     assert report["light_file"] is None
-    assert "estimated_lights" in [warning["code"] for warning in report["warnings"]]
+    assert "estimated_lights" in codes(report)
     assert {"light_directions.txt", "lights.png"} <= set(report["files"])
     found = np.loadtxt("out/ball/light_directions.txt")
     error = angle_between_deg(found, LIGHTS).mean()
@@ -40,128 +40,84 @@ def test_infer(unlit, run, document):
     assert base64.b64encode(picture).decode() in Path("out/ball/page.html").read_text()
     # The files give the same normals again.
     intensities = Path("out/ball/light_intensities.txt")
-    given = ["--intensities", str(intensities) if intensities.exists() else "equal"]
-    lights = ["--lights", "out/ball/light_directions.txt"]
-    assert run("infer", unlit, *lights, *given, "--method", "ls", "-o", "again").code == 0
+    given = f"--intensities {intensities if intensities.exists() else 'equal'}"
+    lights = "--lights out/ball/light_directions.txt"
+    run(f"infer {unlit} {lights} --method ls -o again {given}")
     np.testing.assert_allclose(
         np.load("again/ball/normals.npy"), np.load("out/ball/normals.npy"), atol=2e-4
     )
 
 
 def test_the_message_about_a_missing_light_file_names_it(unlit, run):
-    result = run("infer", unlit)
-    assert (
-        result.code == 3
-        and "--lights estimate" in result.err
-        and "splinecli calibrate" in result.err
-    )
+    run(f"infer {unlit}", code=3, says=("--lights estimate", "splinecli calibrate"))
 
 
 def test_a_light_file_of_the_user_is_kept(unlit, run):
     """Here, the results go into the folder of the capture."""
     own = "\n".join("0 0 1" for _ in LIGHTS)
     (unlit / "light_directions.txt").write_text(own)
-    command = (
-        "infer",
-        unlit,
-        "--lights",
-        "estimate",
-        "--intensities",
-        "equal",
-        "--method",
-        "ls",
-        "-o",
-        ".",
-    )
-    result = run(*command)
-    assert result.code == 5 and "not from an earlier run" in result.err
+    command = f"infer {unlit} --lights estimate --intensities equal --method ls -o ."
+    run(command, code=5, says="not from an earlier run")
     assert (unlit / "light_directions.txt").read_text() == own
     (unlit / "light_directions.txt").unlink()
-    assert run(*command).code == 0
+    run(command)
     # Its own files are replaced, and removed where the lights are no longer estimated.
-    assert run(*command, "--overwrite").code == 0
+    run(f"{command} --overwrite")
     np.savetxt("given.txt", LIGHTS)
-    assert (
-        run(
-            "infer", unlit, "--lights", "given.txt", "--method", "ls", "-o", ".", "--overwrite"
-        ).code
-        == 0
-    )
+    run(f"infer {unlit} --lights given.txt --method ls -o . --overwrite")
     assert not (unlit / "light_directions.txt").exists()
 
 
 def test_info(unlit, run, document):
-    report = document("info", unlit, "--lights", "estimate", "--plot", "sky/lights.png")
+    report = document(f"info {unlit} --lights estimate --plot sky/lights.png")
     assert angle_between_deg(np.array(report["estimated_lights"]["directions"]), LIGHTS).mean() < 5
     assert report["light_directions"] is None and "estimated_lights" in report["warning_codes"]
-    assert "estimated from the images" in run("info", unlit, "--lights", "estimate").out
+    assert "estimated from the images" in run(f"info {unlit} --lights estimate").out
 
 
 def test_evaluate(unlit, run):
     np.savetxt(unlit / "light_directions.txt", LIGHTS)
     (unlit / "light_intensities.txt").write_text("1\n" * len(LIGHTS))
-    arguments = (
-        "evaluate",
-        unlit,
-        "--method",
-        "ls",
-        "--n-lights",
-        "8",
-        "--trials",
-        "2",
-        "--json",
-        "-o",
-        "scores",
-    )
-    given = json.loads(run(*arguments).out)
-    result = run(*arguments, "--lights", "estimate")
-    estimated = json.loads(result.out)
+    arguments = f"evaluate {unlit} --method ls --n-lights 8 --trials 2 --json -o scores"
+    given = run(arguments).json
+    result = run(f"{arguments} --lights estimate", says="are wrong by")
+    estimated = result.json
     check(estimated, "Results")
     assert given["results"][0]["found_light_error_deg"] is None
     error = estimated["results"][0]["found_light_error_deg"]
     assert 0 < error < 6
     assert given["results"][0]["mae_deg"] < estimated["results"][0]["mae_deg"] < error + 3
-    assert estimated["protocol"]["lights_estimated"] and "are wrong by" in result.err
+    assert estimated["protocol"]["lights_estimated"]
 
 
 def test_first_light(unlit, run):
     """The whole image: it shows no outline."""
     (unlit / "mask.png").unlink()
-    crop = ("infer", unlit, "--crop", "16,16,32,32", "--lights", "estimate", "--method", "ls")
-    for command in (crop, ("info", unlit, "--crop", "16,16,32,32", "--lights", "estimate")):
-        result = run(*command)
-        assert result.code == 3 and result.err.startswith(
-            "splinecli: ball: the images do not show the outline"
-        )
-    assert (
-        "--auto-mask" in result.err
-        and "--first-light left, upper-left, or its azimuth" in result.err
-    )
+    crop = f"infer {unlit} --crop 16,16,32,32 --lights estimate --method ls"
+    for command in (crop, f"info {unlit} --crop 16,16,32,32 --lights estimate"):
+        says = ("--auto-mask", "--first-light left, upper-left, or its azimuth")
+        result = run(command, code=3, says=says)
+        assert result.err.startswith("splinecli: ball: the images do not show the outline")
     side = str(np.degrees(np.arctan2(LIGHTS[0, 1], LIGHTS[0, 0])))
-    assert run(*crop, "--first-light", side).code == 0
+    run(f"{crop} --first-light {side}")
     assert angle_between_deg(np.loadtxt("out/ball/light_directions.txt"), LIGHTS).mean() < 15
-    result = run("infer", unlit, "--first-light", side)
-    assert result.code == 2 and "--first-light needs --lights estimate" in result.err
-    result = run(*crop, "--first-light", "north")
-    assert (
-        result.code == 2
-        and "the first light comes from 'north'; expected one of right," in result.err
-    )
+    run(f"infer {unlit} --first-light {side}", code=2, says="--first-light needs --lights estimate")
+    words = "the first light comes from 'north'; expected one of right,"
+    run(f"{crop} --first-light north", code=2, says=words)
 
 
 def test_contradictions(unlit, run):
-    for command, *options in (
-        ("infer", "--light-distance", "100"),
-        ("infer", "--light-positions", "x.txt"),
-        ("infer", "--light-frame", "x-left"),
-        ("infer", "--light-format", "azel"),
-        ("infer", "--refine-lights"),
-        ("info", "--check-lights"),
-        ("evaluate", "--refine-lights"),
-        ("evaluate", "--light-noise-deg", "2"),
+    for command in (
+        "infer --light-distance 100",
+        "infer --light-positions x.txt",
+        "infer --light-frame x-left",
+        "infer --light-format azel",
+        "infer --refine-lights",
+        "info --check-lights",
+        "evaluate --refine-lights",
+        "evaluate --light-noise-deg 2",
     ):
-        result = run(command, unlit, *options, "--lights", "estimate")
-        assert (result.code, "--lights estimate" in result.err) == (2, True), options
+        run(f"{command} {unlit} --lights estimate", code=2, says="--lights estimate")
     assert not Path("out").exists()
 
 
@@ -170,8 +126,8 @@ def test_a_film(run, document):
     film = write_film(Path("clip.avi"), sphere_film(lights))
     mask = sphere(96)[1]
     assert cv2.imwrite("mask.png", mask.astype(np.uint8) * 255)
-    command = ("infer", film, "--lights", "estimate", "--mask", "mask.png", "--method", "ls")
-    report = document(*command)
+    command = f"infer {film} --lights estimate --mask mask.png --method ls"
+    report = document(command)
     check(report, "Report")
     frames = sorted(Path("out/frames/clip").glob("*.png"))
     assert report["capture"] == "clip" and report["n_lights"] == len(frames) <= 24
@@ -180,57 +136,43 @@ def test_a_film(run, document):
     normals = np.load("out/clip/normals.npy")
     assert angle_between_deg(normals[mask], sphere(96)[0][mask]).mean() < 6
     # The frames are a capture of their own, and stay while the film does.
-    document(
-        "infer",
-        "out/frames/clip",
-        "--lights",
-        "out/clip/light_directions.txt",
-        "-o",
-        "b",
-        "--method",
-        "ls",
-    )
+    document("infer out/frames/clip --lights out/clip/light_directions.txt -o b --method ls")
     times = [frame.stat().st_mtime_ns for frame in frames]
-    assert "already done" in run(*command).err
+    run(command, says="already done")
     assert [frame.stat().st_mtime_ns for frame in frames] == times
     # Of another film, nothing is replaced without --update.
     write_film(film, sphere_film(lights[::-1].copy()))
-    result = run(*command)
-    assert result.code == 5 and "frames of another film" in result.err and "--update" in result.err
+    run(command, code=5, says=("frames of another film", "--update"))
     assert [frame.stat().st_mtime_ns for frame in frames] == times
-    assert run(*command, "--update").code == 0
+    run(f"{command} --update")
     assert sorted(Path("out/frames/clip").glob("*.png")) != frames
     # Nothing else counts as a frame, and a damaged frame is taken again.
     first = min(Path("out/frames/clip").glob("*.png"))
     whole = first.read_bytes()
     first.write_bytes(b"")
-    assert run(*command, "--overwrite").code == 0 and first.read_bytes() == whole
+    run(f"{command} --overwrite")
+    assert first.read_bytes() == whole
     Path("out/frames/clip/mask.png").write_bytes(whole)
-    result = run(*command, "--overwrite")
-    assert result.code == 5 and "contains mask.png, which is not a frame" in result.err
+    run(f"{command} --overwrite", code=5, says="contains mask.png, which is not a frame")
     Path("out/frames/clip/mask.png").unlink()
-    assert (
-        "from the camera axis"
-        in run("info", film, "--lights", "estimate", "--mask", "mask.png").out
-    )
+    assert "from the camera axis" in run(f"info {film} --lights estimate --mask mask.png").out
 
 
 def test_films_that_cannot_be_used(run):
     film = write_film(Path("clip.avi"), sphere_film(np.repeat(path_of_lamp(1), 10, axis=0)))
     film.with_name("...mp4").write_bytes(film.read_bytes())
     for code, arguments, words in (
-        (2, (film,), "Add --lights estimate"),
+        (2, film, "Add --lights estimate"),
         (
             3,
-            (film, "--lights", "estimate"),
+            f"{film} --lights estimate",
             "clip.avi: found 1 of 10 frames that are sharp and differ in their light",
         ),
-        (3, ("none.mp4", "--lights", "estimate"), "the film does not exist"),
+        (3, "none.mp4 --lights estimate", "the film does not exist"),
         # a name that would lead out of OUT/frames is none of a film
-        (3, ("...mp4", "--lights", "estimate"), ""),
+        (3, "...mp4 --lights estimate", ""),
     ):
-        result = run("infer", *arguments)
-        assert result.code == code and words in result.err
+        run(f"infer {arguments}", code=code, says=words)
     assert not Path("out/frames").exists()
 
 
@@ -242,5 +184,5 @@ def test_a_planted_record_of_a_film_deletes_nothing(run):
     frames = dict.fromkeys([own.name, *(f"frame-00000{i}.png" for i in range(6))], 4)
     record = {"film": "x", "sha256": "y", "frames": frames}
     Path("out/frames/clip/film.json").write_text(json.dumps(record))
-    result = run("infer", film, "--lights", "estimate", "--update")
-    assert result.code == 5 and own.read_bytes() == b"mine"
+    run(f"infer {film} --lights estimate --update", code=5)
+    assert own.read_bytes() == b"mine"

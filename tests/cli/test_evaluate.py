@@ -1,7 +1,6 @@
 """`splinecli evaluate` on analytic captures: files, tables, and what goes wrong."""
 
 import csv
-import json
 from pathlib import Path
 
 import cv2
@@ -24,8 +23,7 @@ def dataset(make_capture):
 
 
 def test_files_and_table(dataset, run, golden):
-    result = run("evaluate", dataset, "--method", "ls", "--n-lights", 4, "--trials", 3, "--seed", 0)
-    assert (result.code, result.err) == (0, "")
+    result = run(f"evaluate {dataset} --method ls --n-lights 4 --trials 3 --seed 0", err="")
     golden("evaluate_table.txt", result.out)
     golden("evaluate_results.json", Path("evaluation/results.json").read_text())
     golden("evaluate_table.md", Path("evaluation/table.md").read_text())
@@ -57,18 +55,14 @@ def overexposed(make_capture):
     )
 
 
-@pytest.mark.parametrize("n_lights", ["all", 7])
-@pytest.mark.parametrize("method", ["iw12", "ls"])
-def test_infer_and_evaluate_give_the_same_figure(overexposed, document, method, n_lights):
+@pytest.mark.parametrize("method, lights", [("iw12", ""), ("ls", "--n-lights 7 --seed 3")])
+def test_infer_and_evaluate_give_the_same_figure(overexposed, document, method, lights):
     """The draw of `infer` is the first of `evaluate`."""
-    lights = [] if n_lights == "all" else ["--n-lights", n_lights, "--seed", 3]
     figures = []
-    for policy, reading in (([], "restored"), (["--as-stored"], "as stored")):
-        shared = [overexposed, "--method", method, *policy, "--overwrite"]
-        report = document("infer", *shared, *lights)
-        evaluation = document(
-            "evaluate", *shared, *(lights or ["--n-lights", "all"]), "--trials", 1
-        )
+    for policy, reading in (("", "restored"), ("--as-stored", "as stored")):
+        shared = f"{overexposed} --method {method} {policy} --overwrite"
+        report = document(f"infer {shared} {lights}")
+        evaluation = document(f"evaluate --trials 1 {shared} {lights or '--n-lights all'}")
         (result,) = evaluation["results"]
         assert result["mae_deg"] == pytest.approx(report["angular_error_deg"]["mean"], abs=1e-4)
         assert (evaluation["protocol"]["as_stored"], report["reading"]) == (bool(policy), reading)
@@ -79,47 +73,48 @@ def test_infer_and_evaluate_give_the_same_figure(overexposed, document, method, 
 
 def test_a_capture_without_ground_truth_is_skipped(dataset, run, golden):
     (dataset / "matte/normals_gt.npy").unlink()
-    result = run("evaluate", dataset, "--method", "ls", "--n-lights", 4, "--trials", 1, "--json")
-    assert result.code == 3
+    result = run(f"evaluate {dataset} --method ls --n-lights 4 --trials 1 --json", code=3)
     golden("evaluate_skipped.txt", result.err)
-    assert [entry["capture"] for entry in json.loads(result.out)["skipped"]] == ["matte"]
+    assert [entry["capture"] for entry in result.json["skipped"]] == ["matte"]
 
 
 def test_refusals(refuse, dataset):
-    cases = (
-        (3, ["nowhere"]),
-        (2, [dataset, "--n-lights", "few"]),
-        (2, [dataset, "--n-lights", 2]),
-        (2, [dataset, "--method", "magic"]),
-        (2, [dataset, "--trials", 0]),
-        (2, [dataset, "--n-lights", 4, "--draws", "draws.txt"]),
-        (3, [dataset, "--draws", "draws.txt"]),
-        (2, [dataset, "--method", "ls", "--n-lights", 9]),
-        (2, [dataset, "--method", "ls", "--skip-first", "shaded"]),
-        (2, [dataset, "--method", "ls", "--skip-first", "=3"]),
-        (2, [dataset, "--method", "ls", "--n-lights", 4, "--skip-first", "cow=3"]),
-        (2, [dataset, "--method", "ls", "--n-lights", "all", "--skip-first", 6]),
-        (2, [dataset, "--method", "ls", "--n-lights", 4, "--skip-first", 20]),
-        (2, [dataset, "--draws", "draws.txt", "--trials", 3]),
-        (2, [dataset, "--pixel", "3,4"]),
-        (2, [dataset, "--method", "ls", "--pixel", "3,4", "--figures"]),
-        (2, [dataset, "--pixel=-1,4", "--figures"]),
-        (2, [dataset, "--method", "ls", "--pixel", "3", "--figures"]),
-        (2, [dataset, "--jobs", 0]),
-        (4, [dataset, "--method", "cnn-ps", "--weights", "spline-net", "--n-lights", 4]),
-    )
-    refuse("evaluate", cases, "evaluate_refusals.txt")
+    cases = f"""
+        3 nowhere
+        2 {dataset} --n-lights few
+        2 {dataset} --n-lights 2
+        2 {dataset} --method magic
+        2 {dataset} --trials 0
+        2 {dataset} --n-lights 4 --draws draws.txt
+        3 {dataset} --draws draws.txt
+        2 {dataset} --method ls --n-lights 9
+        2 {dataset} --method ls --skip-first shaded
+        2 {dataset} --method ls --skip-first =3
+        2 {dataset} --method ls --n-lights 4 --skip-first cow=3
+        2 {dataset} --method ls --n-lights all --skip-first 6
+        2 {dataset} --method ls --n-lights 4 --skip-first 20
+        2 {dataset} --draws draws.txt --trials 3
+        2 {dataset} --pixel 3,4
+        2 {dataset} --method ls --pixel 3,4 --figures
+        2 {dataset} --pixel=-1,4 --figures
+        2 {dataset} --method ls --pixel 3 --figures
+        2 {dataset} --jobs 0
+        4 {dataset} --method cnn-ps --weights spline-net --n-lights 4
+    """
+    refuse("evaluate", cases)
     assert not Path("evaluation").exists()
 
 
 def test_a_wide_table_is_turned_and_never_cut(make_capture, run, golden):
     for index in range(9):
         make_capture(f"data/capture_number_{index}[red]")
-    result = run("evaluate", "data", "--method", "ls", "--n-lights", "all")
+    result = run("evaluate data --method ls --n-lights all")
     golden("evaluate_wide.txt", result.out)
     assert "capture_number_8[red]" in result.out
-    methods = [f"--method={name}" for name in ("ls", "ls-trimmed", "l1", "iw12", "st14", "ia14")]
-    wide = run("evaluate", "data", *methods, "--n-lights", "all").out
+    methods = (
+        "--method ls --method ls-trimmed --method l1 --method iw12 --method st14 --method ia14"
+    )
+    wide = run(f"evaluate data --n-lights all {methods}").out
     assert "ls-trimmed" in wide
     assert "capture_number_8[red]" in wide
     assert "…" not in wide
@@ -137,19 +132,8 @@ FILES = [
 
 
 def test_every_file_is_there_and_goes_on(dataset, run):
-    arguments = [
-        "evaluate",
-        dataset,
-        "--method",
-        "ls",
-        "--method",
-        "iw12",
-        "--n-lights",
-        4,
-        "--n-lights",
-        5,
-    ]
-    first = run(*arguments, "--trials", 2, "--json")
+    arguments = f"evaluate {dataset} --method ls --method iw12 --n-lights 4 --n-lights 5"
+    first = run(f"{arguments} --trials 2 --json")
     assert first.code == 0
     assert (
         sorted(path.name for path in Path("evaluation").iterdir() if path.name != ".lock") == FILES
@@ -157,35 +141,22 @@ def test_every_file_is_there_and_goes_on(dataset, run):
     assert "iw12" in Path("evaluation/report.html").read_text()
     kept = Path("evaluation/trials.jsonl").read_text()
     assert len(kept.splitlines()) == 2 * 2 * 2 * 2
-    more = json.loads(run(*arguments, "--trials", 3, "--json").out)
+    more = run(f"{arguments} --trials 3 --json").json
     assert Path("evaluation/trials.jsonl").read_text().startswith(kept)
     assert len(Path("evaluation/trials.jsonl").read_text().splitlines()) == 2 * 2 * 2 * 3
-    for before, after in zip(json.loads(first.out)["results"], more["results"], strict=True):
+    for before, after in zip(first.json["results"], more["results"], strict=True):
         assert after["maes_deg"][:2] == before["maes_deg"]
     # Fewer light counts make no plot, and leave none behind.
-    assert run(*arguments[:-2], "--trials", 3).code == 0
+    assert run(f"{arguments.removesuffix(' --n-lights 5')} --trials 3").code == 0
     assert not Path("evaluation/lights.png").exists()
-    assert run(*arguments, "--trials", 3, "--overwrite", "--jobs", 1).code == 0
+    assert run(f"{arguments} --trials 3 --overwrite --jobs 1").code == 0
     assert len(Path("evaluation/trials.jsonl").read_text().splitlines()) == 2 * 2 * 2 * 3
 
 
 def test_figures(dataset, run):
-    arguments = [
-        "--n-lights",
-        4,
-        "--trials",
-        1,
-        "--max-pixels",
-        30,
-        "--figures",
-        "--pixel",
-        "9,10",
-        "--pixel",
-        "12,5",
-    ]
-    methods = [f"--method={name}" for name in ("ls", "spline-net-pixelwise", "spline-net")]
-    result = run("evaluate", dataset, *methods, *arguments)
-    assert result.code == 0
+    arguments = "--n-lights 4 --trials 1 --max-pixels 30 --figures --pixel 9,10 --pixel 12,5"
+    methods = "--method ls --method spline-net-pixelwise --method spline-net"
+    run(f"evaluate {dataset} {methods} {arguments}")
     # The two networks are one: it has one figure of observation maps.
     names = [
         f"{name}{suffix}.png"
@@ -197,9 +168,11 @@ def test_figures(dataset, run):
     assert maps.shape[1] > maps.shape[0]
     assert Path("evaluation/report.html").read_text().count("data:image/png") == 4
     # The results are there although no figure can be drawn, and earlier figures are gone.
-    outside = run("evaluate", dataset, "--method", "spline-net", *arguments[:-1], "0,0")
-    assert outside.code == 3
-    assert "no figure: the pixel in row 0, column 0 of matte has no ground truth" in outside.err
+    run(
+        f"evaluate {dataset} --method spline-net {arguments.replace('12,5', '0,0')}",
+        code=3,
+        says="no figure: the pixel in row 0, column 0 of matte has no ground truth",
+    )
     assert "spline-net" in Path("evaluation/table.md").read_text()
     assert not list(Path("evaluation/figures").iterdir())
 
@@ -207,9 +180,9 @@ def test_figures(dataset, run):
 def test_all_methods_by_one_word(dataset, run):
     from splinecli.estimate.methods import method_names
 
-    options = ("--method", "all", "--n-lights", "all", "--max-pixels", 9, "--json")
-    result = run("evaluate", dataset / "matte", *options)
-    document = json.loads(result.out)
+    options = "--method all --n-lights all --max-pixels 9 --json"
+    result = run(f"evaluate {dataset / 'matte'} {options}")
+    document = result.json
     assert [scored["method"] for scored in document["results"]] == method_names()
     assert (
         result.err == "splinecli: warning: The weights cnn-ps were trained with 10 lights, not 8.\n"
@@ -220,8 +193,8 @@ def test_all_methods_by_one_word(dataset, run):
 
 def test_the_white_level_is_used_and_named(overexposed, document):
     """A level below the image values makes the values above it saturated, so they are restored."""
-    arguments = ["evaluate", overexposed, "--method", "ls", "--n-lights", "all"]
-    plain, lower = document(*arguments), document(*arguments, "--white-level", 50_000)
+    arguments = f"evaluate {overexposed} --method ls --n-lights all"
+    plain, lower = document(arguments), document(f"{arguments} --white-level 50000")
     assert (plain["protocol"]["white_level"], lower["protocol"]["white_level"]) == (None, 50_000)
     assert lower["results"][0]["mae_deg"] != plain["results"][0]["mae_deg"]
     assert "white level 50000, images restored" in Path("evaluation/table.md").read_text()

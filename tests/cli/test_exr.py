@@ -2,7 +2,6 @@
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from PIL import Image
 from scenes import read_image
 
 
-def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def read(path):
     """The header of an EXR file and its channels, each on its own."""
     library = pytest.importorskip("OpenEXR")
     file = library.File(str(path), separate_channels=True)
@@ -23,8 +22,8 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 @pytest.mark.parametrize("convention", ["opengl", "directx"])
 def test_maps_of_infer(capture, run, convention):
     pytest.importorskip("OpenEXR")
-    options = ("--method", "ls", "--maps", "albedo", "--surface", "--convention", convention)
-    assert run("infer", capture, *options, "--format", "exr,png,npy,tiff").code == 0
+    options = f"--method ls --maps albedo --surface --convention {convention}"
+    run(f"infer {capture} {options} --format exr,png,npy,tiff")
     out = Path("out/sphere")
     green = (
         f"x right, y up, z to the camera; green is y {'up' if convention == 'opengl' else 'down'}"
@@ -49,14 +48,9 @@ def test_maps_of_infer(capture, run, convention):
     assert (out / "depth.png").is_file()
 
 
-@pytest.mark.parametrize(
-    "command", [("infer", "sphere", "--method", "ls"), ("integrate", "missing.npy")]
-)
+@pytest.mark.parametrize("command", ["infer sphere --method ls", "integrate missing.npy"])
 def test_without_the_library_nothing_is_done(capture, run, monkeypatch, command):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    result = run(*command, "--format", "exr")
-    assert (
-        result.code == 2
-        and "EXR files need the package OpenEXR, which is not installed" in result.err
-    )
+    words = "EXR files need the package OpenEXR, which is not installed"
+    run(f"{command} --format exr", code=2, says=words)
     assert not Path("out/sphere").exists()

@@ -22,7 +22,7 @@ from splinecli.cli.signals import GRACE_SECONDS, TOLD, report_interruption
 posix = pytest.mark.skipif(os.name == "nt", reason="POSIX files, signals and limits")
 
 
-def shell(script: str) -> subprocess.CompletedProcess[str]:
+def shell(script):
     return subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=60)
 
 
@@ -35,22 +35,18 @@ def test_devices_and_pipes_are_refused_at_once(capture, run):
         ("--ground-truth", "a file"),
     ):
         for path, kind in (("/dev/zero", "a device"), ("pipe", "a pipe")):
-            result = run("infer", capture, "--method", "ls", option, path)
-            assert (result.code, result.err) == (
-                3,
-                f"splinecli: {path}: found {kind}, expected {expected}.\n",
+            run(
+                f"infer {capture} --method ls {option} {path}",
+                code=3,
+                err=f"splinecli: {path}: found {kind}, expected {expected}.\n",
             )
-    run("infer", capture, "--method", "ls")
+    run(f"infer {capture} --method ls")
     for command, code, expected in (
         ("integrate out/sphere --camera-matrix /dev/zero", 3, "a text file"),
         ("train -o run --config /dev/zero", 4, "a text file"),
         ("integrate /dev/zero -o surface", 3, "a normal map"),
     ):
-        result = run(*command.split())
-        assert (result.code, result.err) == (
-            code,
-            f"splinecli: /dev/zero: found a device, expected {expected}.\n",
-        )
+        run(command, code=code, err=f"splinecli: /dev/zero: found a device, expected {expected}.\n")
 
 
 @posix
@@ -70,14 +66,14 @@ def test_what_is_no_file_is_not_passed_over(capture, run, name, kind):
         os.mkfifo(capture / name)
     else:
         (capture / name).symlink_to("nothing")
-    result = run("infer", capture, "--method", "ls")
+    result = run(f"infer {capture} --method ls", code=3)
     problem = "found a pipe, expected a file" if kind == "a pipe" else "the file does not exist"
-    assert (result.code, result.err) == (3, f"splinecli: sphere/{name}: {problem}.\n")
+    assert result.err == f"splinecli: sphere/{name}: {problem}.\n"
 
 
 @posix
 def test_process_substitution_in_place_of_light_directions(capture, run):
-    run("infer", capture, "--method", "ls", "-o", "expected")
+    run(f"infer {capture} --method ls -o expected")
     command = f"{sys.executable} -m splinecli infer {capture} --method ls --lights"
     for _ in range(2):  # the second time, the same content counts as done
         result = shell(f"{command} <(cat {capture}/light_directions.txt)")
@@ -102,8 +98,7 @@ def test_a_pipe_that_is_too_long_is_refused_not_cut(capture):
 
 def test_a_zero_byte_in_a_list_of_images(capture, run):
     (capture / "filenames.txt").write_text("image1.png\na\0b.png\n")
-    result = run("infer", capture, "--method", "ls")
-    assert result.code == 3
+    result = run(f"infer {capture} --method ls", code=3)
     assert result.err.startswith(
         'splinecli: sphere/filenames.txt:2: the image "a\\x00b.png" does not exist'
     )
@@ -113,28 +108,27 @@ def test_names_cannot_forge_lines_or_move_the_cursor(make_capture, run, tmp_path
     forged = "a\nsplinecli: warning: fake"
     for name in (forged, "\x1b[2J\u202eb"):
         make_capture("plain").rename(tmp_path / name)
-        for command in (
-            ("infer", name, "--method", "ls"),
-            ("infer", name, "--method", "ls"),
-            ("infer", name, "none", "--method", "ls", "--overwrite"),
-            ("info", name),
-            ("evaluate", name, "--method", "ls", "--n-lights", 4, "--trials", 1, "--overwrite"),
-            ("infer", name, "--method", "ls", "--lights", f"{name}/none\n"),
+        results = []
+        for command, code in (
+            ("infer --method ls", 0),
+            ("infer --method ls", 0),
+            ("infer none --method ls --overwrite", 3),
+            ("info", 0),
+            ("evaluate --method ls --n-lights 4 --trials 1 --overwrite", 0),
         ):
-            result = run(*command)
+            results.append(run(command, name, code=code))
+        results.append(run("infer --method ls", name, "--lights", f"{name}/none\n", code=3))
+        for result in results:
             text = result.out + result.err
             assert "\nsplinecli: warning: fake" not in text and not set("\x1b\u202e") & set(text)
     make_capture("plain").rename(tmp_path / "a\nb")
-    assert run("infer", "a\nb", "--method", "ls").out.startswith("out/a\\nb: 448 pixels")
+    assert run("infer --method ls", "a\nb").out.startswith("out/a\\nb: 448 pixels")
 
 
 def test_cells_are_no_formulas(make_capture, run):
     for name, cell in {"=1+1": "'=1+1", "\r=1": "\\r=1", " \n=1": " \\n=1"}.items():
         make_capture(name)
-        result = run(
-            "evaluate", name, "--method", "ls", "--n-lights", 4, "--trials", 1, "--overwrite"
-        )
-        assert result.code == 0
+        run("evaluate --method ls --n-lights 4 --trials 1 --overwrite", name)
         # also splits at \r
         header, row = Path("evaluation/results.csv").read_bytes().decode().splitlines()
         assert dict(zip(header.split(","), row.split(","), strict=True))["capture"] == cell
@@ -148,25 +142,19 @@ def test_a_list_of_images_stays_in_its_folder(capture, make_capture, run):
         "splinecli: sphere/filenames.txt:1: the image"
         ' "../elsewhere/image1.png" is outside of this folder.'
     )
-    for command in (
-        ["infer", "--method", "ls"],
-        ["info"],
-        ["evaluate", "--method", "ls", "--n-lights", 4],
-    ):
-        result = run(command[0], capture, *command[1:])
-        assert result.code == 3 and message in result.err
-        assert "set a link to it there" in result.err
+    for command in ("infer --method ls", "info", "evaluate --method ls --n-lights 4"):
+        run(f"{command} {capture}", code=3, says=(message, "set a link to it there"))
     (capture / "filenames.txt").write_text(
         "\n".join(str((elsewhere / n).absolute()) for n in names)
     )
-    assert "is outside of this folder" in run("info", capture).err
+    run(f"info {capture}", code=3, says="is outside of this folder")
     # It may name links to images elsewhere.
     for number in range(1, 9):
         (capture / f"photo{number}.png").symlink_to(elsewhere.absolute() / f"image{number}.png")
     (capture / "filenames.txt").write_text(
         "".join(f"photo{number}.png\n" for number in range(1, 9))
     )
-    assert run("info", capture).code == 0
+    run(f"info {capture}")
 
 
 @posix
@@ -184,18 +172,18 @@ def test_memory_that_runs_out_is_one_line(capture, make_capture, run, monkeypatc
     make_capture("second")
     decoded = chain([MemoryError()], repeat(DEFAULT))  # the first time only
     monkeypatch.setattr(cv2, "imdecode", Mock(wraps=cv2.imdecode, side_effect=decoded))
-    result = run("infer", capture, "second", "--method", "ls", "-q")
+    result = run(f"infer {capture} second --method ls -q", code=1)
     message = (
         "splinecli: sphere: there is not enough memory. Close other programs, or use smaller"
         " images.\n"
     )
-    assert (result.code, result.err) == (1, message)
+    assert result.err == message
     assert Path("out/second/normals.png").exists()
 
 
 def test_the_end_of_a_file_is_no_interruption(capture, run, monkeypatch):
     monkeypatch.setattr("splinecli.pipeline.info.describe_capture", Mock(side_effect=EOFError))
-    assert run("info", capture).code == 1
+    run(f"info {capture}", code=1)
 
 
 @posix
@@ -215,7 +203,7 @@ def test_a_signal_while_the_program_starts(capture, number):
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "splinecli: interrupted.\n")
 
 
-def start(code: str) -> subprocess.Popen[str]:
+def start(code):
     """Start a process that runs the code as the command line would, and wait until it says so."""
     script = "import importlib, time\nm = importlib.import_module('splinecli.cli.main')"
     script += (

@@ -11,7 +11,7 @@ from estimate.networks.test_official import AuthorsLINet, AuthorsNENet
 
 
 @pytest.fixture(scope="module")
-def checkpoints(tmp_path_factory) -> tuple[Path, Path]:
+def checkpoints(tmp_path_factory):
     folder = tmp_path_factory.mktemp("authors")
     torch.manual_seed(0)
     torch.save(AuthorsLINet().state_dict(), folder / "9-G.ckpt")
@@ -27,40 +27,38 @@ def here(checkpoints):
 
 
 def test_imported_weights_run(run, document, make_capture):
-    result = run("import-weights", "9-G.ckpt", "9-D.ckpt", "-o", "new/official.safetensors")
-    assert (result.code, result.out, result.err) == (0, "new/official.safetensors\n", "")
+    run(
+        "import-weights 9-G.ckpt 9-D.ckpt -o new/official.safetensors",
+        out="new/official.safetensors\n",
+        err="",
+    )
     assert [path.name for path in Path("new").iterdir()] == ["official.safetensors"]
     few = np.zeros((24, 24), np.uint8)
     few[10:14, 10:14] = 255
     cv2.imwrite("few.png", few)
-    weights = ("--weights", "new/official.safetensors")
-    report = document("infer", make_capture("sphere"), "--mask", "few.png", *weights)
+    weights = "--weights new/official.safetensors"
+    report = document(f"infer {make_capture('sphere')} --mask few.png {weights}")
     assert (report["weights"]["name"], report["n_pixels"]) == ("official", 16)
-    quiet = run(
-        "import-weights",
-        "9-G.ckpt",
-        "9-D.ckpt",
-        "-o",
-        "new/official.safetensors",
-        "--overwrite",
-        "-q",
+    run(
+        "import-weights 9-G.ckpt 9-D.ckpt -o new/official.safetensors --overwrite -q",
+        out="",
+        err="",
     )
-    assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
 
 
 def test_refusals(refuse):
     Path("notes.txt").write_text("no weights\n")
     Path("there.safetensors").touch()
-    cases = (
-        (4, ["9-D.ckpt", "9-G.ckpt", "-o", "new.safetensors"]),
-        (4, ["9-G.ckpt", "notes.txt", "-o", "new.safetensors"]),
-        (4, ["9-G.ckpt", "none.ckpt", "-o", "new.safetensors"]),
-        (5, ["9-G.ckpt", "9-D.ckpt", "-o", "."]),
-        (5, ["9-G.ckpt", "9-D.ckpt", "-o", "there.safetensors"]),
-        (5, ["9-G.ckpt", "9-D.ckpt", "-o", "notes.txt/new.safetensors"]),
-        (2, ["9-G.ckpt", "9-D.ckpt"]),
-        (2, ["9-G.ckpt", "-o", "new.safetensors"]),
-    )
-    refuse("import-weights", cases, "import_weights_refusals.txt")
+    cases = """
+        4 9-D.ckpt 9-G.ckpt -o new.safetensors
+        4 9-G.ckpt notes.txt -o new.safetensors
+        4 9-G.ckpt none.ckpt -o new.safetensors
+        5 9-G.ckpt 9-D.ckpt -o .
+        5 9-G.ckpt 9-D.ckpt -o there.safetensors
+        5 9-G.ckpt 9-D.ckpt -o notes.txt/new.safetensors
+        2 9-G.ckpt 9-D.ckpt
+        2 9-G.ckpt -o new.safetensors
+    """
+    refuse("import-weights", cases)
     assert not Path("new.safetensors").exists()
     assert Path("there.safetensors").read_bytes() == b""

@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 from collections import Counter
-from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -33,8 +32,7 @@ from splinecli.records.output_files import (
 
 
 def test_writes_the_contract(capture, truth, run, golden):
-    result = run("infer", capture, "--method", "ls", "--format", "png,npy,tiff")
-    assert (result.code, result.err) == (0, "")
+    result = run(f"infer {capture} --method ls --format png,npy,tiff", err="")
     seconds = read_json("out/sphere/report.json")["seconds"]
     line = "out/sphere: 448 pixels, 8 lights, ls, MAE 0.00 deg (median 0.00)"
     assert result.out == f"{line}, {seconds['total']:.1f} s\n"
@@ -58,7 +56,7 @@ def test_writes_the_contract(capture, truth, run, golden):
 
 
 def test_albedo_and_preview_where_they_are_asked_for(capture, run):
-    assert run("infer", capture, "--method", "ls", "--maps", "albedo,preview").code == 0
+    run(f"infer {capture} --method ls --maps albedo,preview")
     out = Path("out/sphere")
     assert {"albedo.png", "albedo.npy", "preview.png"} <= set(read_report(out)["files"])
     albedo = np.load(out / "albedo.npy")
@@ -73,25 +71,22 @@ def test_albedo_and_preview_where_they_are_asked_for(capture, run):
 
 
 def test_a_surface_in_millimetres(capture, run):
-    arguments = ["--surface", "--pixel-size", 0.1]
-    assert run("infer", capture, "--method", "ls", *arguments).code == 0
+    arguments = "--surface --pixel-size 0.1"
+    run(f"infer {capture} --method ls {arguments}")
     surface = read_report(Path("out/sphere"))["surface"]
     assert (surface["unit"], surface["pixel_size_mm"]) == ("millimetre", 0.1)
     middle, rim = np.load("out/sphere/depth.npy")[11:13, 11:13].mean(), surface["range"][0]
     assert middle - rim == pytest.approx(0.1 * 12 / (2 * 2.5), rel=0.1)
     # One of two rows and columns are read: each pixel of the map is as wide as two of the
     # photographs.
-    assert (
-        run("infer", capture, "--method", "ls", "--scale", "1/2", *arguments, "--overwrite").code
-        == 0
-    )
+    run(f"infer {capture} --method ls --scale 1/2 {arguments} --overwrite")
     scaled = read_report(Path("out/sphere"))["surface"]
     assert scaled["pixel_size_mm"] == 0.2
     assert np.ptp(scaled["range"]) == pytest.approx(np.ptp(surface["range"]), rel=0.2)
 
 
 def test_how_sure_the_network_is(capture, run):
-    assert run("infer", capture, "--maps", "confidence", "--html", "--overwrite").code == 0
+    run(f"infer {capture} --maps confidence --html --overwrite")
     out, mask = Path("out/sphere"), mask_of(capture) > 0
     confidence, report = np.load(out / "confidence.npy"), read_report(out)
     assert (confidence.dtype, confidence.shape) == (np.float32, mask.shape)
@@ -104,7 +99,7 @@ def test_how_sure_the_network_is(capture, run):
     assert_array_equal(picture, np.rint(255 * confidence))
     assert 'alt="Confidence map"' in (out / "page.html").read_text("utf-8")
     (capture / "normals_gt.npy").unlink()
-    said = run("infer", capture, "--overwrite").out
+    said = run(f"infer {capture} --overwrite").out
     assert f"{confidence[mask].mean():.0%} of them likely within 5 deg" in said
 
 
@@ -123,27 +118,27 @@ def darken_background(capture):
 
 def test_a_mask_is_found_where_there_is_none(capture, run, document):
     mask = darken_background(capture)
-    command = ("infer", capture, "--method", "ls", "--auto-mask", "--overwrite")
-    assert "found_mask.png" not in document(*command)["files"]  # the capture's own goes first
+    command = f"infer {capture} --method ls --auto-mask --overwrite"
+    assert "found_mask.png" not in document(command)["files"]  # the capture's own goes first
     (capture / "mask.png").unlink()
-    report = document(*command)
-    found = cv2.imread("out/sphere/found_mask.png", cv2.IMREAD_UNCHANGED)
+    report = document(command)
+    found = read_image("out/sphere/found_mask.png")
     assert ("found_mask.png" in report["files"], report["n_pixels"]) == (
         True,
         np.count_nonzero(found),
     )
     assert (found != mask).mean() < 0.02  # corners are rounded
-    both = run(
-        "infer", capture, "--auto-mask", "--mask", "out/sphere/found_mask.png", "--overwrite"
+    run(
+        f"infer {capture} --auto-mask --mask out/sphere/found_mask.png --overwrite",
+        code=2,
+        says="contradict each other. Leave one out",
     )
-    assert (both.code, "contradict each other. Leave one out" in both.err) == (2, True)
     for path in capture.glob("image*.png"):
         write_image(path, np.full(mask.shape, 30_000, np.uint16))
-    nothing = run("infer", capture, "--method", "ls", "--auto-mask", "-o", "third")
-    assert (nothing.code, "no mask was found" in nothing.err, "--mask" in nothing.err) == (
-        3,
-        True,
-        True,
+    run(
+        f"infer {capture} --method ls --auto-mask -o third",
+        code=3,
+        says=("no mask was found", "--mask"),
     )
 
 
@@ -155,12 +150,12 @@ def test_photographs_with_a_curve_and_ambient_light(capture, document):
     dark = np.full((24, 24), round(65_535 * light ** (1 / 2.2)), np.uint16)
     cv2.imwrite("dark.png", dark)
 
-    report = partial(document, "infer", capture, "--method", "ls", "--overwrite")
-    assert report()["angular_error_deg"]["mean"] > 5
-    given = ("--transfer", "gamma:2.2", "--ambient", "dark.png")
-    assert report(*given)["angular_error_deg"]["mean"] < 0.1
+    command = f"infer {capture} --method ls --overwrite"
+    assert document(command)["angular_error_deg"]["mean"] > 5
+    command += " --transfer gamma:2.2"
+    assert document(f"{command} --ambient dark.png")["angular_error_deg"]["mean"] < 0.1
     write_image(capture / "ambient.png", dark)
-    found = report(*given[:2])
+    found = document(command)
     assert found["angular_error_deg"]["mean"] < 0.1
     text = "ambient.png was subtracted from all images as ambient light."
     assert found["warnings"] == [{"code": "ambient_subtracted", "text": text}]
@@ -174,37 +169,35 @@ def test_a_mended_mask_stays(capture, document):
     painted = np.zeros((24, 24), np.uint8)
     painted[5:15, 5:15] = 255
     cv2.imwrite("out/sphere/found_mask.png", painted)
-    mended = ("--mask", "out/sphere/found_mask.png", "--overwrite")
-    assert document("infer", capture, "--method", "ls", *mended)["n_pixels"] == 100
-    assert_array_equal(cv2.imread("out/sphere/found_mask.png", cv2.IMREAD_UNCHANGED), painted)
+    mended = "--mask out/sphere/found_mask.png --overwrite"
+    assert document(f"infer {capture} --method ls {mended}")["n_pixels"] == 100
+    assert_array_equal(read_image("out/sphere/found_mask.png"), painted)
 
 
-@pytest.mark.parametrize(
-    "part", [("--crop", "1,2,22,21"), ("--crop", "1,1,22,22", "--scale", "1/3")]
-)
+@pytest.mark.parametrize("part", ["--crop 1,2,22,21", "--crop 1,1,22,22 --scale 1/3"])
 def test_a_found_mask_of_a_part_is_a_mask_of_the_capture(capture, run, part):
     mask = darken_background(capture)
     (capture / "mask.png").unlink()
-    assert run("infer", capture, "--method", "ls", "--auto-mask", *part).code == 0
+    run(f"infer {capture} --method ls --auto-mask {part}")
     found = cv2.imread("out/sphere/found_mask.png", cv2.IMREAD_GRAYSCALE)
     assert found.shape == mask.shape
-    given = ("--mask", "out/sphere/found_mask.png", "-o", "again")
-    assert run("infer", capture, "--method", "ls", *given, *part).code == 0
+    given = "--mask out/sphere/found_mask.png -o again"
+    run(f"infer {capture} --method ls {given} {part}")
     assert_array_equal(np.load("again/sphere/normals.npy"), np.load("out/sphere/normals.npy"))
     # It is a mask of whole images, too, without gaps between the rows that were read.
-    assert run("infer", capture, "--method", "ls", *given, "--overwrite").code == 0
+    run(f"infer {capture} --method ls {given} --overwrite")
     assert read_report(Path("again/sphere"))["n_pixels"] == np.count_nonzero(found)
     assert cv2.connectedComponents(found)[0] == 2
 
 
 def test_lights_by_index(capture, document):
-    chosen = document("infer", capture, "--method", "ls", "--light-indices", "6,0,2")
+    chosen = document(f"infer {capture} --method ls --light-indices 6,0,2")
     assert (chosen["n_lights"], chosen["light_indices"]) == (3, [6, 0, 2])
 
 
 def test_distilled(capture, run, document):
     """A quarter of the pixels are learned."""
-    report = document("infer", capture, "--distil", "--maps", "confidence")
+    report = document(f"infer {capture} --distil --maps confidence")
     told = report["distillation"]
     assert 0 < told["sample"] <= report["n_pixels"] / 4
     assert told["held_out"] == pytest.approx(told["sample"] / 8, abs=1)
@@ -212,21 +205,19 @@ def test_distilled(capture, run, document):
     assert report["angular_error_deg"]["mean"] < 2.5
     assert report["options"]["distil"] is True
     assert read_report(Path("out/sphere"))["distillation"] == told
-    assert "contains results made with" in run("infer", capture, "--exact").err
-    assert document("infer", capture, "--exact", "--overwrite")["distillation"] is None
+    run(f"infer {capture} --exact", code=5, says="contains results made with")
+    assert document(f"infer {capture} --exact --overwrite")["distillation"] is None
 
 
 def test_output_that_cannot_be_written(capture, run, golden):
     Path("out").write_text("a file where the folder should be")
-    result = run("infer", capture, "--method", "ls")
-    assert result.code == 5
+    result = run(f"infer {capture} --method ls", code=5)
     golden("error_output.txt", result.err)
 
 
 def test_interrupted_while_estimating(capture, run, monkeypatch):
     monkeypatch.setattr(LeastSquares, "estimate", Mock(side_effect=KeyboardInterrupt))
-    result = run("infer", capture, "--method", "ls")
-    assert (result.code, result.out, result.err) == (130, "", "splinecli: interrupted.\n")
+    run(f"infer {capture} --method ls", code=130, out="", err="splinecli: interrupted.\n")
     assert not Path("out").exists()
 
 
@@ -252,11 +243,11 @@ def test_closed_streams_and_ascii_terminals(capture, make_capture):
 
 
 @pytest.mark.parametrize(
-    ("maps", "scales"),
+    "maps, scales",
     [("relief,curvature,gradient", (1, 0.05)), ("relief:0.5, curvature:0.1,gradient", (0.5, 0.1))],
 )
 def test_scales_of_pictures(capture, run, maps, scales):
-    assert run("infer", capture, "--method", "ls", "--maps", maps, "--format", "npy,tiff").code == 0
+    run(f"infer {capture} --method ls --format npy,tiff --maps", maps)
     assert np.isfinite(np.load(f"out/{capture.name}/gradient.npy")).sum() == 2 * 448
     for name in ("gradient", "relief", "curvature"):
         tiff = tifffile.imread(f"out/{capture.name}/{name}.tiff")
@@ -264,7 +255,7 @@ def test_scales_of_pictures(capture, run, maps, scales):
     for name, scale in zip(("relief", "curvature"), scales, strict=True):
         values = np.atleast_3d(np.load(f"out/{capture.name}/{name}.npy"))[..., 0]
         assert (values.dtype, np.isfinite(values).sum()) == (np.float32, 448)
-        picture = cv2.imread(f"out/{capture.name}/{name}.png", cv2.IMREAD_UNCHANGED)
+        picture = read_image(f"out/{capture.name}/{name}.png")
         expected = 127.5 + 127.5 * np.clip(np.nan_to_num(values) / scale, -1, 1)
         assert_allclose(picture, expected, atol=0.51)
 
@@ -273,9 +264,7 @@ def test_scales_of_pictures(capture, run, maps, scales):
     "maps", ["albedo:2", "relief:", "relief:dark", "relief:0", "curvature:inf", "curvature:nan"]
 )
 def test_scales_that_are_none(capture, run, maps):
-    result = run("infer", capture, "--method", "ls", "--maps", maps)
-    assert (result.code, result.out) == (2, "")
-    assert maps.split(":")[0] in result.err
+    run(f"infer {capture} --method ls --maps {maps}", code=2, says=maps.split(":")[0], out="")
 
 
 def test_each_image_is_opened_at_most_three_times(run):
@@ -287,7 +276,7 @@ def test_each_image_is_opened_at_most_three_times(run):
             opened[Path(arguments[0])] += 1
 
     sys.addaudithook(count)  # for good, so that it has a switch
-    code = run("infer", EXAMPLE, "--method", "ls", "--n-lights", 5, "--maps", "albedo").code
+    code = run(f"infer {EXAMPLE} --method ls --n-lights 5 --maps albedo").code
     counting.clear()
     assert code == 0
     counts = sorted(opened[path] for path in EXAMPLE.glob("[0-9]*.png"))
@@ -297,11 +286,11 @@ def test_each_image_is_opened_at_most_three_times(run):
 def test_no_result_beside_the_images_counts_as_one_of_them(run, document, capture):
     """With every file that infer and integrate write, and the pictures of the other commands."""
     formats = [name for name in NORMALS if name != "exr"]
-    arguments = ["infer", capture, "--method", "ls", "-o", ".", "--surface", "--html"]
+    arguments = f"infer {capture} --method ls -o . --surface --html"
     maps = ",".join(name for name in MAPS if name != "confidence")  # not of this method
-    first = document(*arguments, "--maps", maps, "--format", ",".join(formats))
+    first = document(f"{arguments} --maps {maps} --format {','.join(formats)}")
     surface = [name for name in SURFACE_FILES if name != "exr"]
-    assert run("integrate", capture, "--format", ",".join(surface), "--overwrite").code == 0
+    run(f"integrate {capture} --format {','.join(surface)} --overwrite")
     for name in (*PLOTS, LIGHT_PLOT, ERROR_MAP, "confidence.png", FOUND_MASK):
         if not (capture / name).exists():
             write_image(capture / name, np.zeros((24, 24), np.uint8))
@@ -309,5 +298,5 @@ def test_no_result_beside_the_images_counts_as_one_of_them(run, document, captur
         "mask.png"
     }
     assert len(pictures) > 8 + 20
-    assert document("info", capture)["images"] == 8
-    assert document(*arguments, "--overwrite")["n_lights"] == first["n_lights"] == 8
+    assert document(f"info {capture}")["images"] == 8
+    assert document(f"{arguments} --overwrite")["n_lights"] == first["n_lights"] == 8

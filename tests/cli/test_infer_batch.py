@@ -14,7 +14,7 @@ from urllib.parse import unquote
 import pytest
 
 from capture.test_cyclesps import write_object
-from cli.conftest import read_report
+from cli.conftest import read_report, table
 from splinecli.errors import InputError, UsageError
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.pipeline.batch import infer_batch, list_captures, worst_exit_code
@@ -28,15 +28,12 @@ def test_a_batch_goes_on_past_a_bad_capture(capture, make_capture, run, golden):
     make_capture("broken")
     Path("broken/image3.png").write_bytes(b"no picture")
     make_capture("third")
-    result = run("infer", capture, "broken", "third", "--method", "ls")
-    assert result.code == 3
+    result = run(f"infer {capture} broken third --method ls", code=3)
     golden("batch.out.txt", result.out)
     golden("batch.err.txt", re.sub(r"[0-9]+\.[0-9]$", "SECONDS", result.err, flags=re.MULTILINE))
     assert sorted(path.name for path in Path("out").iterdir()) == ["index.html", "sphere", "third"]
 
-    documents = json.loads(
-        run("infer", capture, "broken", "--method", "ls", "--json", "--overwrite").out
-    )
+    documents = run(f"infer {capture} broken --method ls --json --overwrite", code=3).json
     assert documents[0] == read_report(Path("out/sphere"))
     assert documents[1]["capture"] == "broken"
     assert "image3.png" in documents[1]["error"]
@@ -46,16 +43,16 @@ def test_links_are_called_by_their_own_names(capture, run):
     for link in ("x/obj", "y/obj", "one", "two"):
         Path(link).parent.mkdir(exist_ok=True)
         Path(link).symlink_to(capture.absolute())
-    assert run("infer", "x/obj", "y/obj", "--method", "ls").code == 2
-    assert run("infer", "one", "two", "--method", "ls").code == 0
+    run("infer x/obj y/obj --method ls", code=2)
+    run("infer one two --method ls")
     assert sorted(path.name for path in Path("out").iterdir()) == ["index.html", "one", "two"]
 
 
 def test_two_kinds_of_images_of_a_cyclesps_object(capture, run):
     holder = capture.parent / "Ball"
     write_object(holder, "specular", "metallic")
-    result = run("infer", holder / "images_specular", "Ball/images_metallic", "--method", "ls")
-    assert result.code == 0 and result.err.endswith("2 captures: 2 done; see out/index.html\n")
+    result = run(f"infer {holder / 'images_specular'} Ball/images_metallic --method ls")
+    assert result.err.endswith("2 captures: 2 done; see out/index.html\n")
     assert {path.name for path in Path("out").iterdir()} == {
         "index.html",
         "Ball_specular",
@@ -63,9 +60,11 @@ def test_two_kinds_of_images_of_a_cyclesps_object(capture, run):
     }
     assert read_report(Path("out/Ball_metallic"))["capture"] == "Ball_metallic"
     # An object with several kinds is passed over among others, under its own name.
-    result = run("infer", holder, capture, "--method", "ls", "--overwrite")
-    assert result.code == 3
-    assert "Ball: found 2 folders of images (images_metallic, images_specular)" in result.err
+    result = run(
+        f"infer {holder} {capture} --method ls --overwrite",
+        code=3,
+        says="Ball: found 2 folders of images (images_metallic, images_specular)",
+    )
 
 
 def test_an_index_of_several_captures(capture, make_capture, run):
@@ -74,11 +73,10 @@ def test_an_index_of_several_captures(capture, make_capture, run):
     Path("broken/image3.png").write_bytes(b"no picture")
     Path("out").mkdir()
     Path("out/index.html").write_text("<html>my site</html>", "utf-8")
-    captures = (capture, "a b", "broken", "--method", "ls", "--html")
-    kept = run("infer", *captures)
-    assert (kept.code, "index.html: was not written by splinecli" in kept.err) == (5, True)
+    captures = ("infer sphere broken --method ls --html", "a b")
+    run(*captures, code=5, says="index.html: was not written by splinecli")
     Path("out/index.html").unlink()
-    assert run("infer", *captures).code == 3
+    run(*captures, code=3)
     index = Path("out/index.html").read_text("utf-8")
     links = re.findall(r'href="([^"]+)"', index)
     assert {"sphere/page.html", "a%20b/page.html", "sphere/normals.npy"} <= set(links)
@@ -88,76 +86,53 @@ def test_an_index_of_several_captures(capture, make_capture, run):
         r'<img src="data:image/jpeg;base64,[^"]+" alt="Normal map of ([^"]+)"', index
     )
     assert pages == ["sphere", "a b"]
-    assert run("infer", *captures).code == 3  # our own index is replaced
+    run(*captures, code=3)  # our own index is replaced
     # Later results in the same place join it, and those of a single capture, too.
-    assert run("infer", make_capture("fourth"), "a b", "--method", "ls", "--overwrite").code == 0
-    assert run("infer", make_capture("fifth"), "--method", "ls").code == 0
+    run(f"infer {make_capture('fourth')} --method ls --overwrite", "a b")
+    run(f"infer {make_capture('fifth')} --method ls")
     links = re.findall(r'href="([^"]+)"', Path("out/index.html").read_text("utf-8"))
     assert {f"{name}/normals.npy" for name in ("sphere", "a%20b", "fourth", "fifth")} <= set(links)
     assert len([link for link in links if link == "a%20b/normals.npy"]) == 1
     Path("place/index.html").mkdir(parents=True)
-    assert run("infer", capture, "fourth", "--method", "ls", "-o", "place", "--overwrite").code == 5
+    run(f"infer {capture} fourth --method ls -o place --overwrite", code=5)
 
 
 def test_names_that_are_no_text(capture, make_capture, run):
     odd = make_capture("odd").rename(os.fsdecode(b"x\xff"))
-    assert run("infer", capture, odd, "--method", "ls").code == 0
+    run(f"infer {capture} {odd} --method ls")
     assert 'href="x%FF/normals.npy"' in Path("out/index.html").read_text("utf-8")
 
 
 def test_a_folder_that_is_given_twice_counts_once(capture, run):
     result = run(
-        "infer",
-        capture,
-        capture.absolute(),
-        "others/../sphere",
-        "sphere/",
-        "--method",
-        "ls",
-        "--json",
+        f"infer {capture} {capture.absolute()} others/../sphere sphere/ --method ls --json"
     )
-    (document,) = json.loads(result.out)
-    assert (result.code, result.err, document["capture"]) == (0, "", "sphere")
+    (document,) = result.json
+    assert (result.err, document["capture"]) == ("", "sphere")
     assert not Path("out/index.html").exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "message"),
-    [
-        (
-            ("--maps", "albedo", "confidence"),
-            2,
-            "confidence: the folder does not exist. Write lists with commas",
-        ),
-        (("--lights", "none.txt"), 3, "none.txt: the file does not exist."),
-        (("--mask", "none.png"), 3, "none.png: the file does not exist."),
-        (("--flat-field", "none"), 3, "none: the folder does not exist."),
-        (("--maps", "albedo,depth"), 2, "--maps has 'depth'"),
-        (
-            ("--transfer", "rec709"),
-            2,
-            "'rec709'; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10",
-        ),
-        (("--white-level", "0"), 2, "--white-level is '0'; expected a number above 0"),
-        (("--weights", "spline-net"), 2, "method ls uses no weights"),
-        (("--maps", "confidence"), 2, "method ls does not provide confidence"),
-        (("--update", "--overwrite"), 2, "--overwrite and --update contradict each other"),
-        (("--workers", "0"), 2, "--workers is '0'; expected a number of at least 1, or auto"),
-        (("--workers", "many"), 2, "--workers is 'many'; expected a number of at least 1, or auto"),
-        (
-            ("--workers", "2", "--cluster", "tcp://a:1"),
-            2,
-            "--workers and --cluster contradict each other",
-        ),
-        (("--shard", "3/2"), 2, "--shard is 3/2; expected I/N with I from 1 to N"),
-        (("--shard", "half"), 2, "--shard is 'half'; expected I/N"),
-        (
-            ("--cluster", "none.json"),
-            2,
-            "--cluster is none.json; expected an address such as tcp://scheduler:8786",
-        ),
-    ],
-)
+REFUSED_ARGUMENTS = """
+--maps albedo confidence | 2 | confidence: the folder does not exist. Write lists with commas
+--lights none.txt | 3 | none.txt: the file does not exist.
+--mask none.png | 3 | none.png: the file does not exist.
+--flat-field none | 3 | none: the folder does not exist.
+--maps albedo,depth | 2 | --maps has 'depth'
+--transfer rec709 | 2 | 'rec709'; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10
+--white-level 0 | 2 | --white-level is '0'; expected a number above 0
+--weights spline-net | 2 | method ls uses no weights
+--maps confidence | 2 | method ls does not provide confidence
+--update --overwrite | 2 | --overwrite and --update contradict each other
+--workers 0 | 2 | --workers is '0'; expected a number of at least 1, or auto
+--workers many | 2 | --workers is 'many'; expected a number of at least 1, or auto
+--workers 2 --cluster tcp://a:1 | 2 | --workers and --cluster contradict each other
+--shard 3/2 | 2 | --shard is 3/2; expected I/N with I from 1 to N
+--shard half | 2 | --shard is 'half'; expected I/N
+--cluster none.json | 2 | --cluster is none.json; expected an address such as tcp://scheduler:8786
+"""
+
+
+@pytest.mark.parametrize("arguments, code, message", table(REFUSED_ARGUMENTS))
 def test_arguments_are_checked_before_the_first_capture(
     arguments, code, message, capture, make_capture, run, monkeypatch
 ):
@@ -168,12 +143,12 @@ def test_arguments_are_checked_before_the_first_capture(
     monkeypatch.setattr(
         "splinecli.pipeline.batch.infer_capture", lambda *_, **__: touched.append(1)
     )
-    call = ("infer", capture, "second", "--method", "ls", *arguments)
-    result = run(*call)
-    assert (result.code, result.out, touched, result.err.count("\n")) == (code, "", [], 1)
-    assert message in result.err
+    call = f"infer {capture} second --method ls {arguments}"
+    code = int(code)
+    result = run(call, code=code, says=message)
+    assert (result.out, touched, result.err.count("\n")) == ("", [], 1)
     assert not Path("out").exists()
-    documents = json.loads(run(*call, "--json").out)
+    documents = run(f"{call} --json", code=code).json
     assert [document["exit_code"] for document in documents] == [code]
     assert message in documents[0]["error"]
 
@@ -219,7 +194,7 @@ def test_the_pipeline_reports_to_an_observer(capture, make_capture):
 
     class Recorder(Observer):
         def __init__(self):
-            self.bars: dict[str, list[tuple[float, str]]] = {}
+            self.bars = {}
 
         @contextmanager
         def progress(self, label, total, *, start=0.0, unit=""):
@@ -272,10 +247,10 @@ def test_a_file_that_changes_during_the_run_is_read_anew_in_the_next(capture, st
 
 def test_shards_give_the_results_of_the_whole(capture, make_capture, run):
     names = ["sphere", *map(str, (make_capture(name) for name in ("Second", "third", "\u00e9")))]
-    assert run("infer", *names, "--method", "ls", "-o", "whole").code == 0
+    run("infer --method ls -o whole", *names)
     for number in (3, 1, 2, 5, 4):
-        result = run("infer", *names, "--method", "ls", "--shard", f"{number}/5")
-        assert result.code == 0 and result.out.count("\n") == (number < 5)
+        result = run(f"infer --method ls --shard {number}/5", *names)
+        assert result.out.count("\n") == (number < 5)
     for name in names:
         parts = [Path(place, name, "normals.npy").read_bytes() for place in ("out", "whole")]
         assert parts[0] == parts[1]
@@ -289,22 +264,15 @@ def test_json_lines(capture, make_capture, run):
     """Each line is there when its capture ends, also where an error ends the batch."""
     make_capture("second")
     Path("broken").mkdir()
-    call = ("infer", "sphere", "broken", "second", "--method", "ls")
-    lines = run(*call, "--jsonl").out.splitlines()
-    assert lines == [json.dumps(document) for document in json.loads(run(*call, "--json").out)]
-    for arguments in (
-        ("--jsonl", "--json"),
-        ("--jsonl", "--method", "magic"),
-        ("--jsonl", "--strange"),
-    ):
-        result = run(*call, *arguments)
-        document = json.loads(result.out)
-        assert (result.code, document["capture"], document["exit_code"]) == (2, None, 2)
+    call = "infer sphere broken second --method ls"
+    lines = run(f"{call} --jsonl", code=3).out.splitlines()
+    assert lines == [json.dumps(document) for document in run(f"{call} --json", code=3).json]
+    for arguments in ("--json", "--method magic", "--strange"):
+        document = run(f"{call} --jsonl {arguments}", code=2).json
+        assert (document["capture"], document["exit_code"]) == (None, 2)
 
 
-@pytest.mark.parametrize(
-    ("codes", "worst"), [([], 0), ([0, 3, 0], 3), ([5, 3, 2], 5), ([5, 1, 3], 1)]
-)
+@pytest.mark.parametrize("codes, worst", [([], 0), ([0, 3, 0], 3), ([5, 3, 2], 5), ([5, 1, 3], 1)])
 def test_the_worst_exit_code(codes, worst):
     assert worst_exit_code(codes) == worst
 
@@ -335,9 +303,8 @@ def test_a_failure_is_that_of_its_capture(place, make_capture, run, monkeypatch)
         return original(*arguments, **options)
 
     monkeypatch.setattr(*place, fail)
-    result = run("infer", *names, "--method", "ls", "--json")
-    assert result.code == 1
-    *failed, good = json.loads(result.out)
+    result = run("infer --method ls --json", *names, code=1)
+    *failed, good = result.json
     expected = [(name, code) for name, (_, code) in FAILURES.items()]
     assert [(one["capture"], one["exit_code"]) for one in failed] == expected
     assert good == read_report(Path("out/good"))
@@ -354,10 +321,10 @@ def test_files_without_permission(make_capture, run_without_privileges):
     closed, image, good = (make_capture(name) for name in ("closed", "image", "good"))
     (image / "image1.png").chmod(0)
     closed.chmod(0)
-    result = run_without_privileges("infer", closed, image, good, "--method", "ls", "--json")
+    result = run_without_privileges(f"infer {closed} {image} {good} --method ls --json", code=3)
     closed.chmod(0o755)
-    first, second, third = json.loads(result.out)
-    assert (result.code, first["exit_code"], second["exit_code"]) == (3, 3, 3)
+    first, second, third = result.json
+    assert (first["exit_code"], second["exit_code"]) == (3, 3)
     assert first["error"] == "closed: the folder cannot be read (Permission denied)."
     assert "image/image1.png" in second["error"]
     assert third == read_report(Path("out/good"))
@@ -366,16 +333,19 @@ def test_files_without_permission(make_capture, run_without_privileges):
 def test_what_is_no_folder_is_the_failure_of_its_capture(capture, run):
     """A pattern such as captures/* may match files too; they do not stop the captures."""
     Path("notes.txt").write_text("mine")
-    result = run("infer", "nowhere", "notes.txt", capture, "--method", "ls", "--json")
-    first, second, third = json.loads(result.out)
+    result = run(f"infer nowhere notes.txt {capture} --method ls --json", code=3)
+    first, second, third = result.json
     missing = {"capture": "nowhere", "error": "nowhere: the folder does not exist.", "exit_code": 3}
-    assert (result.code, first) == (3, missing)
+    assert first == missing
     assert "notes.txt: found a file, expected a folder" in second["error"]
     assert third == read_report(Path("out/sphere"))
     # Earlier results of other options do not hide it.
     capture.rename("moved")
-    gone = run("infer", "sphere", "moved", "--method", "ls", "--n-lights", 4)
-    assert (gone.code, "sphere: the folder does not exist" in gone.err) == (3, True)
+    gone = run(
+        "infer sphere moved --method ls --n-lights 4",
+        code=3,
+        says="sphere: the folder does not exist",
+    )
     assert gone.err.endswith("2 captures: 1 done, 1 missing; see out/index.html\n")
 
 
@@ -389,10 +359,10 @@ def test_folders_that_cannot_be_written_do_not_end_a_batch(
     Path("out/closed").mkdir(parents=True, mode=0o555)
     Path("out/file").write_text("mine")
     result = run_without_privileges(
-        "infer", *names, "--method", "ls", "--jsonl", "--workers", workers
+        f"infer --method ls --jsonl --workers {workers}", *names, code=5
     )
     found = {document["capture"]: document for document in map(json.loads, result.out.splitlines())}
-    assert (result.code, found["closed"]["exit_code"], found["file"]["exit_code"]) == (5, 5, 5)
+    assert (found["closed"]["exit_code"], found["file"]["exit_code"]) == (5, 5)
     assert found["closed"]["error"].startswith(
         "out/closed: no permission to write into this folder"
     )
@@ -404,19 +374,19 @@ def test_folders_that_cannot_be_written_do_not_end_a_batch(
 )
 def test_a_full_disk_ends_a_batch(error, capture, make_capture, run, monkeypatch):
     monkeypatch.setattr("splinecli.results.files.write_estimate", Mock(side_effect=error))
-    result = run("infer", capture, make_capture("second"), "--method", "ls", "--json")
-    (document,) = json.loads(result.out)
-    assert (result.code, document["capture"], document["exit_code"]) == (5, None, 5)
+    result = run(f"infer {capture} {make_capture('second')} --method ls --json", code=5)
+    (document,) = result.json
+    assert (document["capture"], document["exit_code"]) == (None, 5)
     assert not Path("out/second").exists()
 
 
 def test_images_in_place_of_their_folder(run, capture):
-    result = run("infer", *sorted(capture.glob("image*.png")), "--method", "ls")
+    result = run("infer --method ls", *sorted(capture.glob("image*.png")), code=2)
     expected = "splinecli: 8 images were given, expected their folder. Pass the folder 'sphere'.\n"
-    assert (result.code, result.err) == (2, expected)
+    assert result.err == expected
 
 
-@pytest.mark.parametrize(("count", "captures"), [(1, 5), (3, 0), (7, 23), (40, 23)])
+@pytest.mark.parametrize("count, captures", [(1, 5), (3, 0), (7, 23), (40, 23)])
 def test_the_union_of_the_shards_is_the_whole(count, captures, tmp_path):
     """Each shard sees the folders in an order of its own, as shells of different languages give
     it.

@@ -11,7 +11,7 @@ import tifffile
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
-from scenes import BUMP_LAMPS, read_json, write_bump
+from scenes import BUMP_LAMPS, read_image, read_json, write_bump
 from splinecli.capture.formats import images
 from splinecli.maths.normals import encode_picture
 from splinecli.pipeline.infer import results_bytes
@@ -38,15 +38,14 @@ def here():
     cv2.imwrite("directx.png", encode_picture(normals, inside, convention="directx")[..., ::-1])
 
 
-def check_heights(depth: np.ndarray) -> None:
+def check_heights(depth):
     _, heights, inside = sphere()
     assert np.array_equal(np.isfinite(depth), inside)
     assert np.nanmean(np.abs(depth - heights)) < 0.005 * np.ptp(heights[inside])
 
 
 def test_heights_and_mesh_of_a_sphere(run):
-    result = run("integrate", "normals.npy", "-o", "out", "--format", "ply,obj,npy,tiff")
-    assert (result.code, result.err) == (0, "")
+    result = run("integrate normals.npy -o out --format ply,obj,npy,tiff", err="")
     inside, depth = sphere()[2], np.load("out/depth.npy")
     assert (depth.dtype, depth.shape) == (np.float32, SHAPE)
     check_heights(depth)
@@ -66,34 +65,19 @@ def test_heights_and_mesh_of_a_sphere(run):
 
 
 def test_a_picture_of_the_other_convention(run):
-    assert (
-        run(
-            "integrate", "directx.png", "--convention", "directx", "-o", "out", "--format", "npy"
-        ).code
-        == 0
-    )
+    run("integrate directx.png --convention directx -o out --format npy")
     check_heights(np.load("out/depth.npy"))
 
 
-@pytest.mark.parametrize("given", [[], ["--convention", "directx"]], ids=["found", "given"])
+@pytest.mark.parametrize("given", ["", "--convention directx"], ids=["found", "given"])
 @pytest.mark.parametrize("form", ["png", "png8", "npy", "tiff"])
 def test_the_convention_of_a_folder_is_recognised(run, capture, form, given):
     """The values of .npy and .tiff have y up, whatever the green of the pictures means."""
     depths = []
-    for convention, more in (("opengl", []), ("directx", given)):
-        arguments = [
-            "--method",
-            "ls",
-            "--format",
-            form,
-            "--convention",
-            convention,
-            "-o",
-            convention,
-        ]
-        assert run("infer", capture, *arguments).code == 0
-        result = run("integrate", f"{convention}/sphere", "--format", "npy", "-q", *more)
-        assert (result.code, result.out, result.err) == (0, "", "")
+    for convention, more in (("opengl", ""), ("directx", given)):
+        arguments = f"--method ls --format {form} --convention {convention} -o {convention}"
+        run(f"infer {capture} {arguments}")
+        run(f"integrate {convention}/sphere --format npy -q {more}", out="", err="")
         depths.append(np.load(f"{convention}/sphere/depth.npy"))
     assert_allclose(*depths, atol=0.2)
     assert np.nanmax(depths[0]) - np.nanmin(depths[0]) > 1
@@ -101,8 +85,7 @@ def test_the_convention_of_a_folder_is_recognised(run, capture, form, given):
 
 def test_an_array_of_something_else(run):
     np.save("albedo.npy", np.random.default_rng(0).uniform(0, 0.4, (*SHAPE, 3)).astype(np.float32))
-    result = run("integrate", "albedo.npy", "-o", "out")
-    assert (result.code, "these are not normals" in result.err) == (3, True)
+    run("integrate albedo.npy -o out", code=3, says="these are not normals")
 
 
 @pytest.mark.parametrize("where", ["mask", "alpha"])
@@ -114,16 +97,15 @@ def test_a_background_that_is_not_black(run, where):
     cut = inside.astype(np.uint16) * 65_535
     cv2.imwrite("white.png", np.dstack([picture, cut]) if where == "alpha" else picture)
     cv2.imwrite("mask.png", cut)
-    arguments = ["integrate", "white.png", "-o", "out", "--format", "npy"]
+    arguments = "integrate white.png -o out --format npy"
     if where == "mask":
-        refused = run(*arguments)
-        assert (refused.code, "these are not normals" in refused.err) == (3, True)
-        arguments += ["--mask", "mask.png"]
-    assert run(*arguments).code == 0
+        run(arguments, code=3, says="these are not normals")
+        arguments += " --mask mask.png"
+    run(arguments)
     check_heights(np.load("out/depth.npy"))
 
 
-def write_depth(form: str, depth: np.ndarray) -> str:
+def write_depth(form, depth):
     if form == "npy":
         np.save("prior.npy", depth)
     elif form == "tif":
@@ -142,24 +124,13 @@ def test_a_prior(run, form):
     """Its heights in millimetres decide where the surface is."""
     _, heights, inside = sphere()
     prior = write_depth(form, np.where(inside, 0.5 * (heights + 100), np.nan).astype(np.float32))
-    arguments = [
-        "normals.png",
-        "--prior",
-        prior,
-        "--pixel-size",
-        "0.5",
-        "-o",
-        "out",
-        "--format",
-        "npy",
-        "--json",
-    ]
-    report = json.loads(run("integrate", *arguments).out)
+    arguments = f"normals.png --prior {prior} --pixel-size 0.5 -o out --format npy --json"
+    report = run(f"integrate {arguments}").json
     assert (report["prior"], report["unit"]) == (prior, "millimetre")
     assert_allclose(np.load("out/depth.npy")[inside], 0.5 * (heights + 100)[inside], atol=0.2)
 
 
-def with_one(value: float, every: int = 1) -> np.ndarray:
+def with_one(value, every=1):
     """Return the heights, or one of so many, with another value in one pixel."""
     heights = np.where(np.arange(2000).reshape(SHAPE) % every == 0, sphere()[1], np.nan)
     heights[9, 20] = value
@@ -192,12 +163,8 @@ BAD_PRIORS = {
 def test_a_bad_prior(run, case):
     prior, message = BAD_PRIORS[case]
     np.save("prior.npy", prior)
-    result = run("integrate", "normals.png", "--prior", "prior.npy", "-o", "out")
-    assert (result.code, message in result.err, Path("out/surface.json").exists()) == (
-        3,
-        True,
-        False,
-    ), result.err
+    run("integrate normals.png --prior prior.npy -o out", code=3, says=message)
+    assert not Path("out/surface.json").exists()
 
 
 @pytest.mark.parametrize("form", ["npy", "tif", "exr"])
@@ -207,14 +174,9 @@ def test_a_damaged_prior(run, form):
     whole = prior.read_bytes()
     for content in (b"\x93NUMPY\x01\x00garbage", whole[: len(whole) // 2]):
         prior.write_bytes(content)
-        result = run("integrate", "normals.png", "--prior", prior, "-o", "out")
-        assert (result.code, result.out, result.err.count("\n"), prior.name in result.err) == (
-            3,
-            "",
-            1,
-            True,
-        ), result
-    assert run("integrate", "normals.png", "--prior-detail", "9", "-o", "out").code == 2
+        result = run(f"integrate normals.png --prior {prior} -o out", code=3, says=prior.name)
+        assert (result.out, result.err.count("\n")) == ("", 1)
+    run("integrate normals.png --prior-detail 9 -o out", code=2)
 
 
 VIEWS = {
@@ -236,13 +198,11 @@ def test_a_folder_of_results_gives_the_surface_of_infer(run, capture, view):
     np.savetxt("lamps.txt", BUMP_LAMPS)
     Path("camera.txt").write_text("100 0 15.5\n0 100 15.5\n0 0 1\n")
     folder = write_bump(Path("bump")) if "lamps.txt" in VIEWS[view] else capture
-    arguments = ["--method", "ls", "--maps", "albedo", "--surface", "--json"]
-    [report] = json.loads(run("infer", folder, *VIEWS[view].split(), *arguments).out)
+    arguments = "--method ls --maps albedo --surface --json"
+    [report] = run(f"infer {folder} {VIEWS[view]} {arguments}").json
     Path("camera.txt").unlink()
     places = (Path("out") / folder, Path("again"))
-    again = json.loads(
-        run("integrate", places[0], "-o", "again", "--format", "ply,glb,npy", "--json").out
-    )
+    again = run(f"integrate {places[0]} -o again --format ply,glb,npy --json").json
     assert {name: again[name] for name in report["surface"]} == report["surface"]
     # Normals that are read are scaled to unit length again, which may change their last bit.
     depths = [np.load(place / "depth.npy") for place in places]
@@ -253,14 +213,13 @@ def test_a_folder_of_results_gives_the_surface_of_infer(run, capture, view):
         assert_array_equal(one.faces, other.faces)  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("size", [["--pixel-size", "2e-9"], ["--object-width", "64e-9"]])
+@pytest.mark.parametrize("size", ["--pixel-size 2e-9", "--object-width 64e-9"])
 def test_the_unit_of_lamps_is_not_that_of_the_surface(document, size):
     """Lamps in a unit in which pixels are smaller than any in millimetres."""
     np.savetxt("lamps.txt", 1e-9 * BUMP_LAMPS)
-    document(
-        "infer", write_bump(Path("bump")), "--method", "ls", *size, "--light-positions", "lamps.txt"
-    )
-    report = document("integrate", "out/bump", "--format", "npy")
+    write_bump(Path("bump"))
+    document(f"infer bump --method ls --light-positions lamps.txt {size}")
+    report = document("integrate out/bump --format npy")
     assert (report["unit"], report["pixel_size_mm"]) == ("pixel", None)
 
 
@@ -269,8 +228,8 @@ def test_a_part_in_colour_by_perspective(run):
     cv2.imwrite("half.png", np.tile(np.uint8(255) * (np.arange(SHAPE[1]) < 25), (SHAPE[0], 1)))
     cv2.imwrite("red.png", np.tile(np.uint8((0, 0, 200)), (*SHAPE, 1)))  # in OpenCV's order
     Path("camera.txt").write_text("200 0 24.5\n0 200 19.5\n0 0 1\n")
-    options = ["--mask", "half.png", "--colours", "red.png", "--camera-matrix", "camera.txt"]
-    report = json.loads(run("integrate", "normals.npy", *options, "-o", "out", "--json").out)
+    options = "--mask half.png --colours red.png --camera-matrix camera.txt"
+    report = run(f"integrate normals.npy {options} -o out --json").json
     assert report["camera"] == "perspective"
     depth = np.load("out/depth.npy")
     assert np.isnan(depth[:, 25:]).all()
@@ -280,9 +239,7 @@ def test_a_part_in_colour_by_perspective(run):
     assert (mesh.vertices[:, 2] < 0).all()  # before the camera, which looks along -z
     # A pixel without a size counts as a millimetre. Columns 7 to 24 are on the object.
     assert trimesh.load("out/mesh.glb").extents[0] == pytest.approx(0.017, rel=0.05)
-    sized = json.loads(
-        run("integrate", "normals.npy", *options, "-o", "sized", "--pixel-size", 2, "--json").out
-    )
+    sized = run(f"integrate normals.npy {options} -o sized --pixel-size 2 --json").json
     assert (sized["unit"], sized["pixel_size_mm"]) == ("millimetre", 2)
     assert sized["range"] == pytest.approx(np.multiply(report["range"], 200 * 2), rel=1e-6)
 
@@ -290,8 +247,8 @@ def test_a_part_in_colour_by_perspective(run):
 def test_millimetres_in_the_files(run):
     import trimesh
 
-    arguments = ("--pixel-size", 0.5, "--format", "glb,ply,stl,npy", "--json")
-    report = json.loads(run("integrate", "normals.npy", "-o", "out", *arguments).out)
+    arguments = "--pixel-size 0.5 --format glb,ply,stl,npy --json"
+    report = run(f"integrate normals.npy -o out {arguments}").json
     _, heights, inside = sphere()
     columns = np.flatnonzero(inside.any(axis=0))
     width_mm, depth = 0.5 * float(np.ptp(columns)), np.load("out/depth.npy")
@@ -306,9 +263,9 @@ def test_millimetres_in_the_files(run):
 
 
 def test_a_picture_of_the_depth(run):
-    arguments = ["--format", "npy,png", "--pixel-size", 0.5, "--json"]
-    report = json.loads(run("integrate", "normals.npy", "-o", "out", *arguments).out)
-    picture, depth = cv2.imread("out/depth.png", cv2.IMREAD_UNCHANGED), np.load("out/depth.npy")
+    arguments = "--format npy,png --pixel-size 0.5 --json"
+    report = run(f"integrate normals.npy -o out {arguments}").json
+    picture, depth = read_image("out/depth.png"), np.load("out/depth.npy")
     low, high = report["range"]
     assert (picture.dtype, report["unit"]) == (np.uint16, "millimetre")
     assert_array_equal(picture == 0, np.isnan(depth))
@@ -325,8 +282,10 @@ def test_the_angle_of_a_levelled_surface_is_printed(run):
         "tilted.npy",
         np.full((20, 30, 3), (0.0, np.sin(np.radians(5)), np.cos(np.radians(5))), np.float32),
     )
-    result = run("integrate", "tilted.npy", "-o", "out", "--level", "plane")
-    assert (result.code, result.err) == (0, "The surface was levelled by 5.00 degrees\n")
+    run(
+        "integrate tilted.npy -o out --level plane",
+        err="The surface was levelled by 5.00 degrees\n",
+    )
 
 
 def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monkeypatch):
@@ -336,23 +295,24 @@ def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monke
     mask = np.zeros((24, 24), np.uint8)
     mask[8:16, 12] = 255  # a line
     cv2.imwrite("line.png", mask)
-    result = run("infer", capture, "--method", "ls", "--mask", "line.png", "--surface")
-    assert (result.code, "sphere: the mesh has no triangles" in result.err) == (3, True)
-    assert "or leave --surface out" in result.err
+    run(
+        f"infer {capture} --method ls --mask line.png --surface",
+        code=3,
+        says=("sphere: the mesh has no triangles", "or leave --surface out"),
+    )
     assert not Path("out/sphere/report.json").exists()
 
-    assert run("infer", capture, "--method", "ls", "--overwrite").code == 0
+    run(f"infer {capture} --method ls --overwrite")
     n_pixels = read_json("out/sphere/report.json")["n_pixels"]
     assert results_bytes(n_pixels, 5, surface=True) - results_bytes(n_pixels, 5) == n_pixels * 600
     monkeypatch.setattr(images, "available_memory", lambda: n_pixels * 600.0)
-    assert run("integrate", "out/sphere").code == 0
+    run("integrate out/sphere")
     monkeypatch.setattr(images, "available_memory", lambda: n_pixels * 600.0 - 1)
-    refused = run("integrate", "out/sphere", "--overwrite")
-    assert (refused.code, f"the surface of {n_pixels} pixels takes" in refused.err) == (3, True)
+    run("integrate out/sphere --overwrite", code=3, says=f"the surface of {n_pixels} pixels takes")
 
 
 def test_a_damaged_report_is_named(run, capture):
-    assert run("infer", capture, "--method", "ls", "--format", "npy", "--surface").code == 0
+    run(f"infer {capture} --method ls --format npy --surface")
     path = Path("out", capture, "report.json")
     whole = read_json(path)
     for where, key, value in (
@@ -373,17 +333,13 @@ def test_a_damaged_report_is_named(run, capture):
         report = deepcopy(whole)
         (report[where] if where else report)[key] = value
         path.write_text(json.dumps(report))
-        result = run("integrate", path.parent, "-o", "again")
         problem = (
             " is damaged"
             if key in ("files", "file_sizes")
             else ": is damaged, or from another version"
         )
-        assert (result.code, result.err.count("\n"), f"report.json{problem}" in result.err) == (
-            3,
-            1,
-            True,
-        ), (key, value)
+        result = run(f"integrate {path.parent} -o again", code=3, says=f"report.json{problem}")
+        assert result.err.count("\n") == 1
 
 
 def test_refusals(refuse):
@@ -397,23 +353,22 @@ def test_refusals(refuse):
     Path("mirrored.txt").write_text("-200 0 24.5\n0 200 19.5\n0 0 1\n")
     Path("done").mkdir()
     Path("done/mesh.ply").touch()
-    cases = (
-        (2, []),
-        (2, ["normals.npy", "--format", "fbx"]),
-        (2, ["normals.npy", "--discontinuity", -1]),
-        (2, ["normals.npy", "--pixel-size", 0]),
-        (2, ["normals.npy", "--decimate", 0]),
-        (3, ["dot.npy"]),
-        (3, ["missing.npy"]),
-        (3, ["done"]),
-        (3, ["flat.npy"]),
-        (3, ["normals.npy", "--mask", "small.png"]),
-        (3, ["normals.npy", "--mask", "corner.png"]),
-        (3, ["normals.npy", "--colours", "small.png"]),
-        (3, ["normals.npy", "--camera-matrix", "camera.txt"]),
-        (3, ["normals.npy", "--camera-matrix", "mirrored.txt"]),
-        (5, ["normals.npy", "-o", "done"]),
-    )
-    placed = [(code, words if "-o" in words else [*words, "-o", "out"]) for code, words in cases]
-    refuse("integrate", placed, "integrate_refusals.txt")
+    cases = """
+        2 -o out
+        2 normals.npy --format fbx -o out
+        2 normals.npy --discontinuity -1 -o out
+        2 normals.npy --pixel-size 0 -o out
+        2 normals.npy --decimate 0 -o out
+        3 dot.npy -o out
+        3 missing.npy -o out
+        3 done -o out
+        3 flat.npy -o out
+        3 normals.npy --mask small.png -o out
+        3 normals.npy --mask corner.png -o out
+        3 normals.npy --colours small.png -o out
+        3 normals.npy --camera-matrix camera.txt -o out
+        3 normals.npy --camera-matrix mirrored.txt -o out
+        5 normals.npy -o done
+    """
+    refuse("integrate", cases)
     assert not Path("out").exists()

@@ -2,42 +2,43 @@
 the lamps are.
 """
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from cli.conftest import table
 from cli.test_schema import check
-from scenes import BUMP_LAMPS, BUMP_MM, read_image, write_bump, write_image
+from scenes import BUMP_LAMPS, BUMP_MM, codes, read_image, write_bump, write_image
+from splinecli.maths.normals import unit
 
 
 @pytest.fixture
-def bump() -> Path:
+def bump():
     return write_bump(Path("bump"))
 
 
 @pytest.fixture
 def infer(document):
-    return partial(document, "infer", "bump", "--method", "ls", "--overwrite")
+    return lambda words="": document(f"infer bump --method ls --overwrite {words}")
 
 
 @pytest.fixture
 def mean_error(infer):
-    return lambda *arguments: infer(*arguments)["angular_error_deg"]["mean"]
+    return lambda words="": infer(words)["angular_error_deg"]["mean"]
 
 
 def test_one_distance_for_all_lamps(mean_error, bump):
-    positions = 170 * BUMP_LAMPS / np.linalg.norm(BUMP_LAMPS, axis=1, keepdims=True)
+    positions = 170 * unit(BUMP_LAMPS)
     write_bump(bump, positions)
     np.savetxt(bump / "light_directions.txt", positions / 170)
-    assert mean_error("--light-distance", 170, "--object-width", BUMP_MM) < 0.1
+    assert mean_error(f"--light-distance 170 --object-width {BUMP_MM}") < 0.1
     assert mean_error() > 5
-    assert mean_error("--light-distance", 200, "--object-width", BUMP_MM) < 3
+    assert mean_error(f"--light-distance 200 --object-width {BUMP_MM}") < 3
 
 
 @pytest.fixture
-def near(bump: Path) -> Path:
+def near(bump):
     """The bump with the files that tell where its lamps are."""
     np.savetxt(bump / "light_positions.txt", BUMP_LAMPS)
     (bump / "pixel_size.txt").write_text("2\n")
@@ -47,34 +48,34 @@ def near(bump: Path) -> Path:
 def test_files_and_options_mean_the_same(run, infer, mean_error, near):
     report = infer()
     assert report["angular_error_deg"]["mean"] < 0.1
-    assert [warning["code"] for warning in report["warnings"]] == ["few_lights"]
+    assert codes(report) == ["few_lights"]
     assert report["near_lamps"]["pixel_size"] == 2
     assert report["near_lamps"]["distances"] == pytest.approx(
         np.linalg.norm(BUMP_LAMPS, axis=1), abs=1e-3
     )
     assert (
         "lamps        near, as in bump/light_positions.txt; a pixel is 2 wide"
-        in run("info", "bump").out
+        in run("info bump").out
     )
     # A changed position is a change of the capture.
     moved = BUMP_LAMPS.copy()
     moved[0] += 5
     np.savetxt(near / "light_positions.txt", moved)
-    assert "other input files" in run("infer", "bump", "--method", "ls").err
+    run("infer bump --method ls", code=5, says="other input files")
     for name in ("light_positions.txt", "pixel_size.txt"):
         (near / name).unlink()
     np.savetxt("lamps.txt", BUMP_LAMPS)
-    for scale in (("--pixel-size", 2), ("--object-width", BUMP_MM)):
-        assert mean_error("--light-positions", "lamps.txt", *scale) < 0.1
+    for scale in ("--pixel-size 2", f"--object-width {BUMP_MM}"):
+        assert mean_error(f"--light-positions lamps.txt {scale}") < 0.1
     np.save("lamps.npy", BUMP_LAMPS)
-    assert mean_error("--light-positions", "lamps.npy", "--pixel-size", 2) < 0.1
+    assert mean_error("--light-positions lamps.npy --pixel-size 2") < 0.1
     # The same file as directions: distant lights, and without a scale nothing to warn of.
-    assert mean_error("--lights", "lamps.txt") > 5
+    assert mean_error("--lights lamps.txt") > 5
 
 
 def test_distant_lights_despite_positions_are_warned_of(infer, near):
     np.savetxt("directions.txt", BUMP_LAMPS)
-    warning, _ = infer("--lights", "directions.txt")["warnings"]
+    warning, _ = infer("--lights directions.txt")["warnings"]
     assert warning["code"] == "near_lamps"
     # The middles of the outermost pixels.
     corners = np.array([(x, y, 0) for x in (-31, 31) for y in (-31, 31)])
@@ -83,30 +84,29 @@ def test_distant_lights_despite_positions_are_warned_of(infer, near):
     angle = np.degrees(np.arccos(cosine / np.linalg.norm(BUMP_LAMPS, axis=1)[:, None])).max()
     assert f"a light direction changes by up to {angle:.0f} degrees" in warning["text"]
     np.savetxt(near / "light_positions.txt", 10 * BUMP_LAMPS)
-    (warning,) = infer("--lights", "directions.txt")["warnings"]
+    (warning,) = infer("--lights directions.txt")["warnings"]
     assert warning["code"] == "few_lights"
 
 
-REFUSED = [
-    ("--light-distance 170", 2, "--light-distance needs the size of a pixel"),
-    ("--light-distance 170 --light-positions l.txt", 2, "contradict each other"),
-    ("--pixel-size 1 --object-width 2 --light-distance 3", 2, "contradict each other"),
-    ("--pixel-size -1", 2, "--pixel-size is '-1'; expected a number above 0"),
-    ("--surface --pixel-size 1e9", 2, "the pixel size is 1e+09 mm, expected"),
-    ("--pixel-size 1", 2, "--pixel-size concerns near lamps, and bump has no light_positions.txt"),
-    ("--light-positions l.txt --lights l.txt", 2, "contradict each other"),
-    ("--light-positions missing.txt", 3, "missing.txt: the file does not exist"),
-    ("--light-positions l.txt", 3, "the scale of the lamp positions is unknown"),
-    ("--light-positions l.txt --pixel-size 1 --light-format azel", 2, "concerns light directions"),
-]
+REFUSED = """
+--light-distance 170 | 2 | --light-distance needs the size of a pixel
+--light-distance 170 --light-positions l.txt | 2 | contradict each other
+--pixel-size 1 --object-width 2 --light-distance 3 | 2 | contradict each other
+--pixel-size -1 | 2 | --pixel-size is '-1'; expected a number above 0
+--surface --pixel-size 1e9 | 2 | the pixel size is 1e+09 mm, expected
+--pixel-size 1 | 2 | --pixel-size concerns near lamps, and bump has no light_positions.txt
+--light-positions l.txt --lights l.txt | 2 | contradict each other
+--light-positions missing.txt | 3 | missing.txt: the file does not exist
+--light-positions l.txt | 3 | the scale of the lamp positions is unknown
+--light-positions l.txt --pixel-size 1 --light-format azel | 2 | concerns light directions
+"""
 
 
-@pytest.mark.parametrize(("arguments", "code", "message"), REFUSED)
+@pytest.mark.parametrize("arguments, code, message", table(REFUSED))
 def test_refused_options(run, bump, arguments, code, message):
     np.savetxt(bump / "light_directions.txt", BUMP_LAMPS)
     np.savetxt("l.txt", BUMP_LAMPS)
-    result = run("infer", "bump", "--method", "ls", *arguments.split())
-    assert (result.code, message in result.err) == (code, True), result.err
+    run(f"infer bump --method ls {arguments}", code=int(code), says=message)
 
 
 def test_wrong_files_are_named(run, near):
@@ -150,8 +150,7 @@ def test_wrong_files_are_named(run, near):
         (near / "pixel_size.txt").write_text("2\n")
         np.savetxt(near / "light_positions.txt", BUMP_LAMPS)
         (near / name).write_text(text)
-        result = run("infer", "bump", "--method", "ls")
-        assert (result.code, message in result.err) == (3, True), result.err
+        run("infer bump --method ls", code=3, says=message)
         (near / name).unlink()
 
 
@@ -165,26 +164,26 @@ def test_a_near_camera_under_distant_lights(run, document, infer, mean_error, bu
     matrix = np.array([(40, 0, 16.5), (0, 40, 15.5), (0, 0, 1)])
     np.savetxt("camera.txt", matrix)
     np.savetxt(bump / "camera_matrix.txt", matrix)
-    assert "other input files" in run("infer", "bump", "--method", "ls").err
+    run("infer bump --method ls", code=5, says="other input files")
     found = infer()
     check(found, "Report")
     assert (found["camera_matrix"], found["near_lamps"]) == (matrix.tolist(), None)
     assert found["inputs_sha256"] != orthographic["inputs_sha256"]
     assert found["angular_error_deg"] == orthographic["angular_error_deg"]
-    assert "camera       perspective, focal length 40 pixels" in run("info", "bump").out
-    given = infer("--camera-matrix", "camera.txt", "--crop", "4,2,20,24")
+    assert "camera       perspective, focal length 40 pixels" in run("info bump").out
+    given = infer("--camera-matrix camera.txt --crop 4,2,20,24")
     assert given["camera_matrix"] == [[40, 0, 12.5], [0, 40, 13.5], [0, 0, 1]]
-    scored = document("evaluate", "bump", "--method", "ia14", "--n-lights", "all")["results"][0]
-    assert scored["mae_deg"] == pytest.approx(mean_error("--method", "ia14"), abs=1e-3)
+    scored = document("evaluate bump --method ia14 --n-lights all")["results"][0]
+    assert scored["mae_deg"] == pytest.approx(mean_error("--method ia14"), abs=1e-3)
     (bump / "camera_matrix.txt").unlink()
-    assert scored["mae_deg"] != pytest.approx(mean_error("--method", "ia14"), abs=1e-3)
+    assert scored["mae_deg"] != pytest.approx(mean_error("--method ia14"), abs=1e-3)
 
 
 def test_a_file_of_lobes(run, infer, mean_error, near):
     """One line is for all lamps. The frame of the positions is that of the lobes, too."""
     without = infer()
     (near / "light_lobes.txt").write_text("0 0.2 -1 0\n")
-    assert "other input files" in run("infer", "bump", "--method", "ls").err
+    run("infer bump --method ls", code=5, says="other input files")
     even = infer()
     check(even, "Report")
     assert even["near_lamps"]["lobes"] == [pytest.approx([0, 0.1961, -0.9806, 0], abs=1e-4)] * 7
@@ -196,7 +195,7 @@ def test_a_file_of_lobes(run, infer, mean_error, near):
     assert narrow["angular_error_deg"]["mean"] > without["angular_error_deg"]["mean"] + 0.1
     np.savetxt(near / "light_positions.txt", BUMP_LAMPS * (1, -1, 1))
     (near / "light_lobes.txt").write_text("0 -0.2 -1 5\n")
-    assert mean_error("--light-frame", "y-down") == narrow["angular_error_deg"]["mean"]
+    assert mean_error("--light-frame y-down") == narrow["angular_error_deg"]["mean"]
 
 
 @pytest.mark.parametrize("command", ["infer", "info"])
@@ -204,45 +203,35 @@ def test_positions_in_another_unit_than_the_pixel_size(run, near, command):
     """The bump is 64 mm wide, its lamps 162 mm away and more: in metres they would be inside the
     bump.
     """
-    arguments = [
-        command,
-        "bump",
-        *(["--method", "ls", "--overwrite"] if command == "infer" else []),
-    ]
+    arguments = f"{command} bump {'--method ls --overwrite' if command == 'infer' else ''}"
     distances = np.linalg.norm(BUMP_LAMPS, axis=1) / 1000
     np.savetxt(near / "light_positions.txt", BUMP_LAMPS / 1000)
-    refused = run(*arguments, "--strict")
-    assert refused.code == 3
     lamp = (
         f"lamp {distances.argmin() + 1} is {distances.min():.3g} from the middle of the object,"
         " which is 64"
     )
-    assert lamp in refused.err
-    assert "inside the object. Give all lengths in one unit, such as millimetres" in refused.err
+    words = "inside the object. Give all lengths in one unit, such as millimetres"
+    run(f"{arguments} --strict", code=3, says=(lamp, words))
     for factor, words in (
         (0.3, "A lamp is very near"),
         (1000, "so far away that their light is parallel"),
     ):
         np.savetxt(near / "light_positions.txt", BUMP_LAMPS * factor)
-        for strict, code in ((("--strict",), 3), ((), 0)):
-            warned = run(*arguments, *strict)
-            assert (warned.code, words in warned.err) == (code, True), warned.err
+        for strict, code in (("--strict", 3), ("", 0)):
+            run(f"{arguments} {strict}", code=code, says=words)
     np.savetxt(near / "light_positions.txt", BUMP_LAMPS)
-    assert run(*arguments, "--strict").code == 0
+    run(f"{arguments} --strict")
 
 
 def test_evaluate_and_prepare(run, document, near):
     """Scoring a sample of the pixels finds the surface from all of them."""
 
     def error(words):
-        return document("evaluate", "bump", "--method", "ls", "--trials", 1, *words.split())[
-            "results"
-        ][0]["mae_deg"]
+        return document(f"evaluate bump --method ls --trials 1 {words}")["results"][0]["mae_deg"]
 
     assert max(error("--n-lights 5"), error("--n-lights 5 --max-pixels 50")) < 0.2
     assert error("--n-lights all --light-noise-deg 4") > 0.5
-    refused = run("prepare", "bump", "-o", "set")
-    assert refused.code == 3 and "near lamps, and training needs distant lights" in refused.err
+    run("prepare bump -o set", code=3, says="near lamps, and training needs distant lights")
 
 
 def test_albedo_and_saturation(infer, near):
@@ -252,8 +241,8 @@ def test_albedo_and_saturation(infer, near):
     for path in near.glob("*.png"):
         image = read_image(path)
         write_image(path, np.minimum(image, 26_000))
-    stored = infer("--white-level", "26000", "--as-stored")
-    restored = infer("--white-level", "26000", "--maps", "albedo")
+    stored = infer("--white-level 26000 --as-stored")
+    restored = infer("--white-level 26000 --maps albedo")
     assert restored["angular_error_deg"]["mean"] < 0.5 * stored["angular_error_deg"]["mean"]
     albedo = np.load("out/bump/albedo.npy")
     assert albedo.std() < 0.03 * albedo.mean()

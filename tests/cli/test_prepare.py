@@ -15,7 +15,7 @@ from scenes import read_image, read_json, write_image
 
 
 @pytest.fixture
-def cycles_images() -> dict[str, np.ndarray]:
+def cycles_images():
     """The images (F, H, W, 3) by kind of one object in the published layout, below the folder
     `cycles`.
     """
@@ -23,16 +23,14 @@ def cycles_images() -> dict[str, np.ndarray]:
     return shiny | write_object(Path("cycles/PRPS_Diffuse/Turtle"), "diffuse", seed=1, n_lights=4)
 
 
-def arrays(entry: str) -> dict[str, np.ndarray]:
+def arrays(entry):
     return {path.stem: np.load(path) for path in (Path("set") / entry).glob("*.npy")}
 
 
 def test_a_capture(run, capture, truth):
-    result = run("prepare", capture, "-o", "set")
-    assert result.code == 0
-    assert (
-        result.out
-        == "set: 1 entries of 1 scenes, 448 pixels, 0 MB; overview in set/contact_sheet.png\n"
+    result = run(
+        f"prepare {capture} -o set",
+        out="set: 1 entries of 1 scenes, 448 pixels, 0 MB; overview in set/contact_sheet.png\n",
     )
     assert result.err == "sphere: 448 pixels, 8 lights, sphere\n"
     found = arrays("sphere")
@@ -44,7 +42,7 @@ def test_a_capture(run, capture, truth):
 
 
 def test_a_cycles_tree_reads_to_the_values_put_in(document, cycles_images):
-    summary = document("prepare", "cycles", "-o", "set")
+    summary = document("prepare cycles -o set")
     assert (summary["entries"], summary["scenes"]) == (3, 1)
     whole, half = arrays("Turtle_diffuse"), arrays("Turtle_specular")
     # The masks are a box of 5 x 7 pixels.
@@ -66,13 +64,12 @@ def test_a_cycles_tree_reads_to_the_values_put_in(document, cycles_images):
 def test_the_same_command_continues(run, make_capture):
     one, two = make_capture("one"), make_capture("two")
     shutil.move(two / "image3.png", "hidden.png")
-    result = run("prepare", one, two, "-o", "set")
+    result = run(f"prepare {one} {two} -o set", code=3, says="two")
     # The good capture is in the set, and the bad one is named.
-    assert result.code == 3 and result.out.startswith("set: 1 entries of 1 scenes, 448 pixels")
-    assert "two" in result.err
+    assert result.out.startswith("set: 1 entries of 1 scenes, 448 pixels")
     before = Path("set/one/observations.npy").stat()
     shutil.move("hidden.png", two / "image3.png")
-    assert run("prepare", one, two, "-o", "set").out.startswith("set: 2 entries of 2 scenes")
+    assert run(f"prepare {one} {two} -o set").out.startswith("set: 2 entries of 2 scenes")
     assert Path("set/one/observations.npy").stat().st_mtime_ns == before.st_mtime_ns
 
 
@@ -84,7 +81,7 @@ def test_captures_of_one_name_get_entries_of_their_own(run, make_capture):
         (capture, "b", capture),
         ("b", capture),
     ):  # they keep their names in another order
-        assert run("prepare", *sources, "-o", "set", "--quiet").code == 0
+        run("prepare -o set --quiet", *sources)
         assert {path.name for path in Path("set").iterdir() if path.is_dir()} == {"a", "a-2"}
         times.append([Path(f"set/{name}/normals.npy").stat().st_mtime_ns for name in ("a", "a-2")])
     assert times[0] == times[1]
@@ -103,27 +100,24 @@ CHANGES = {
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_changed_capture_is_named_and_read_again_with_update(run, make_capture, change):
     one, two = make_capture("one"), make_capture("two")
-    run("prepare", one, "-o", "set", "--quiet")
+    run(f"prepare {one} -o set --quiet")
     before = arrays("one")
     CHANGES[change](one)
-    result = run("prepare", one, two, "-o", "set", "--json")
+    result = run(f"prepare {one} {two} -o set --json", code=5)
     # The stale entry is kept and named, and the other capture is added.
-    summary = json.loads(result.out)
+    summary = result.json
     hint = "Add --update to read it again, or choose another -o."
     message = f"one: its files changed since the entry one was made. {hint}"
-    assert (result.code, result.err) == (
-        5,
-        f"splinecli: {message}\ntwo: 448 pixels, 8 lights, two\n",
-    )
+    assert result.err == f"splinecli: {message}\ntwo: 448 pixels, 8 lights, two\n"
     assert (summary["entries"], summary["skipped"]) == (
         2,
         [{"source": "one", "reason": message, "exit_code": 5}],
     )
     np.testing.assert_array_equal(arrays("one")["observations"], before["observations"])
-    assert run("prepare", one, two, "-o", "set", "--update", "--quiet").code == 0
+    run(f"prepare {one} {two} -o set --update --quiet")
     after = arrays("one")
     assert any((after[name] != before[name]).any() for name in ("observations", "normals"))
-    assert run("prepare", one, two, "-o", "set", "--quiet").code == 0
+    run(f"prepare {one} {two} -o set --quiet")
 
 
 def test_saturated_pixels_are_restored_unless_as_stored(run, capture):
@@ -131,21 +125,22 @@ def test_saturated_pixels_are_restored_unless_as_stored(run, capture):
     picture = read_image(capture / "image2.png").astype(np.float64)
     write_image(capture / "image2.png", (1.4 * picture).clip(0, 65535).astype(np.uint16))
     np.savetxt(capture / "light_intensities.txt", [[1.4 if i == 1 else 1] * 3 for i in range(8)])
-    assert run("prepare", capture, "-o", "set", "--quiet").code == 0
-    assert run("prepare", capture, "-o", "raw", "--as-stored", "--quiet").code == 0
+    run(f"prepare {capture} -o set --quiet")
+    run(f"prepare {capture} -o raw --as-stored --quiet")
     found, stored = arrays("sphere"), np.load("raw/sphere/observations.npy")
     expected = found["normals"] @ found["light_directions"].T * 60_000 / 65_535  # a matte sphere
     assert (np.abs(stored - expected).max(axis=1) > 0.01).sum() > 20
     assert_allclose(found["observations"], expected, atol=2e-3)
     # The two readings do not share an entry.
-    refused = run("prepare", capture, "-o", "raw")
-    assert (
-        refused.code == 5 and "was made with reading = 'as stored', not 'restored'" in refused.err
+    run(
+        f"prepare {capture} -o raw",
+        code=5,
+        says="was made with reading = 'as stored', not 'restored'",
     )
 
 
 @pytest.fixture
-def cube() -> Path:
+def cube():
     """A cube's mesh, its top turned to the camera."""
     pytest.importorskip("embreex", reason="needs the extra 'render'")
     corners = [f"v {x} {y} {z}" for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
@@ -158,9 +153,9 @@ def test_scenes_and_a_mesh_are_rendered(run, cube, monkeypatch):
     # Coarser shapes, for speed.
     monkeypatch.setattr("splinecli.workshop.synthesis.shapes.SPACING", 0.04)
     monkeypatch.setattr("splinecli.workshop.synthesis.shapes.FEWEST_FACES", 100)
-    arguments = ("prepare", "--mesh", cube, "--size", 16, "--n-lights", 20, "-o", "set")
-    result = run(*arguments, "--scenes", 1)
-    assert result.code == 0 and result.out.startswith("set: 18 entries of 2 scenes, ")
+    arguments = f"prepare --mesh {cube} --size 16 --n-lights 20 -o set"
+    result = run(f"{arguments} --scenes 1")
+    assert result.out.startswith("set: 18 entries of 2 scenes, ")
     assert result.err.count(", 20 lights, rendered: ") == 18
     for kind in ("diffuse", "specular", "metallic"):
         found = arrays(f"cube-{kind}")
@@ -174,60 +169,46 @@ def test_scenes_and_a_mesh_are_rendered(run, cube, monkeypatch):
     assert normal_map[7, 7, 2] > 0.9
     before = Path("set/scene0000-diffuse/observations.npy").read_bytes()
     # A larger N adds scenes and keeps the others.
-    assert run(*arguments, "--scenes", 2, "--quiet").code == 0
+    run(f"{arguments} --scenes 2 --quiet")
     assert Path("set/scene0000-diffuse/observations.npy").read_bytes() == before
     assert Path("set/scene0001-diffuse").is_dir()
-    refused = run(*arguments, "--scenes", 2, "--seed", 1)
-    assert (
-        refused.code,
-        "the entry cube-diffuse was made with seed = 0, not 1. Choose" in refused.err,
-    ) == (5, True)
+    run(
+        f"{arguments} --scenes 2 --seed 1",
+        code=5,
+        says="the entry cube-diffuse was made with seed = 0, not 1. Choose",
+    )
 
 
 def test_groups_have_the_meshes_as_bodies(run, cube, monkeypatch):
     monkeypatch.setattr("splinecli.workshop.synthesis.shapes.SPACING", 0.05)
     monkeypatch.setattr("splinecli.workshop.synthesis.groups.SPACING", 0.05)
     monkeypatch.setattr("splinecli.workshop.synthesis.groups.FEWEST_FACES", 100)
-    arguments = (
-        "prepare",
-        "--mesh",
-        cube,
-        "--groups",
-        2,
-        "--size",
-        16,
-        "--n-lights",
-        20,
-        "-o",
-        "set",
-    )
-    result = run(*arguments)
-    assert result.code == 0 and result.out.startswith("set: 18 entries of 2 scenes, ")
+    arguments = f"prepare --mesh {cube} --groups 2 --size 16 --n-lights 20 -o set"
+    result = run(arguments)
+    assert result.out.startswith("set: 18 entries of 2 scenes, ")
     manifest = json.loads(Path("set/manifest.json").read_text())
     assert {entry["scene"] for entry in manifest["entries"]} == {"group0000", "group0001"}
     assert not Path("set/cube-diffuse").exists()
     # With --views, the mesh is also rendered alone; the groups stay.
-    assert run(*arguments, "--views", 1).out.startswith("set: 27 entries of 3 scenes, ")
-    assert run(*arguments, "--mesh", "cube.obj").code == 5
+    assert run(f"{arguments} --views 1").out.startswith("set: 27 entries of 3 scenes, ")
+    run(f"{arguments} --mesh cube.obj", code=5)
 
 
 def test_workers_render_the_same_set(run, cube):
     pytest.importorskip("distributed", reason="needs the extra 'cluster'")
     Path("block.obj").write_text(cube.read_text())
-    more = ("--mesh", "block.obj", "--scenes", 1)
-    arguments = ("prepare", "--mesh", cube, "--size", 16, "--n-lights", 20)
-    alone = run(*arguments, *more, "-o", "alone")
+    more = "--mesh block.obj --scenes 1"
+    arguments = f"prepare --mesh {cube} --size 16 --n-lights 20"
+    alone = run(f"{arguments} {more} -o alone")
     # The set has the cube already.
-    assert run(*arguments, "-o", "set", "-q").code == 0
-    together = run(*arguments, *more, "-o", "set", "--workers", 2)
-    assert (together.code, together.err) == (0, alone.err)
+    run(f"{arguments} -o set -q")
+    run(f"{arguments} {more} -o set --workers 2", err=alone.err)
     assert content(Path("alone")) == content(Path("set"))
 
 
 def test_a_mesh_that_the_camera_cannot_see(run, cube):
     Path("back.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 3 2\n")
-    result = run("prepare", "--mesh", "back.obj", "--size", 16, "--n-lights", 20, "-o", "set")
-    assert (result.code, result.out) == (3, "")
+    result = run("prepare --mesh back.obj --size 16 --n-lights 20 -o set", code=3, out="")
     assert result.err.startswith(
         "splinecli: back.obj: the camera sees nothing of the mesh. The camera looks along -z"
     )
@@ -240,13 +221,13 @@ def test_refusals(refuse, make_capture, cycles_images):
     Path("full").mkdir()
     Path("full/notes.txt").write_text("mine")
     Path("cube.txt").write_text("no mesh")
-    cases = (
-        (2, ["-o", "set"]),
-        (3, ["missing", "-o", "set"]),
-        (3, [blind, "-o", "set"]),
-        (3, ["cycles/PRPS/Turtle/images_metallic", "-o", "set2"]),
-        (5, [make_capture("good"), "-o", "full"]),
-        (3, ["--mesh", "missing.ply", "-o", "set3"]),
-        (2, ["--scenes", -1, "-o", "set3"]),
-    )
-    refuse("prepare", cases, "prepare_refusals.txt")
+    cases = f"""
+        2 -o set
+        3 missing -o set
+        3 {blind} -o set
+        3 cycles/PRPS/Turtle/images_metallic -o set2
+        5 {make_capture("good")} -o full
+        3 --mesh missing.ply -o set3
+        2 --scenes -1 -o set3
+    """
+    refuse("prepare", cases)

@@ -5,14 +5,13 @@ arrives once.
 import json
 import os
 import shutil
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 
-from cli.conftest import read_report
+from cli.conftest import read_report, table
 from scenes import read_json
 from splinecli.pipeline.batch import infer_batch
 from splinecli.pipeline.infer_options import InferOptions
@@ -23,13 +22,12 @@ from tiny_networks import random_network
 
 
 def test_refuses_to_overwrite(capture, run, golden):
-    run("infer", capture, "--method", "ls")
+    run(f"infer {capture} --method ls")
     before = read_report(Path("out/sphere"))
-    result = run("infer", capture, "--method", "ls", "--n-lights", 4)
-    assert (result.code, result.out) == (5, "")
+    result = run(f"infer {capture} --method ls --n-lights 4", code=5, out="")
     golden("error_exists.txt", result.err)
     assert read_report(Path("out/sphere")) == before
-    assert run("infer", capture, "--method", "ls", "--n-lights", 4, "--overwrite").code == 0
+    run(f"infer {capture} --method ls --n-lights 4 --overwrite")
     assert read_report(Path("out/sphere"))["n_lights"] == 4
 
 
@@ -39,29 +37,30 @@ def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
     whole = broken.read_bytes()
     broken.write_bytes(b"no picture")
     captures = ("sphere", "second", "third")
-    first = run("infer", *captures, "--method", "ls")
-    assert (first.code, "3 captures: 2 done, 1 failed; see" in first.err) == (3, True)
+    run("infer --method ls", *captures, code=3, says="3 captures: 2 done, 1 failed; see")
     before = [Path("out", name, "normals.npy").stat().st_mtime_ns for name in captures[:2]]
     broken.write_bytes(whole)
     Path("out", f".index.html.x{UNFINISHED}").touch()  # a killed process was writing this
-    again = run("infer", *captures, "--method", "ls")
-    assert again.code == 0 and f"splinecli: warning: out: {UNDONE}" in again.err
+    again = run(
+        "infer --method ls",
+        *captures,
+        says=(f"splinecli: warning: out: {UNDONE}", "out/second: already done, skipped\n"),
+    )
     assert again.out.startswith("out/third: ")
-    assert "out/second: already done, skipped\n" in again.err
     assert again.err.endswith("3 captures: 1 done, 2 already done; see out/index.html\n")
     assert before == [Path("out", name, "normals.npy").stat().st_mtime_ns for name in captures[:2]]
     # The same in JSON has all reports.
-    reports = json.loads(run("infer", *captures, "--method", "ls", "--json").out)
+    reports = run("infer --method ls --json", *captures).json
     assert [report["capture"] for report in reports] == list(captures)
 
 
-def replace_in(path: Path, old: str, new: str) -> tuple[str, ...]:
+def replace_in(path, old, new):
     path.write_text(path.read_text().replace(old, new, 1))
-    return ()
+    return ""
 
 
 CHANGES = {
-    "made with another --n-lights": lambda _: ("--n-lights", "4"),
+    "made with another --n-lights": lambda _: "--n-lights 4",
     "other input files": lambda capture: replace_in(
         capture / "light_directions.txt", "\n", " # anew\n"
     ),
@@ -72,16 +71,15 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("reason", CHANGES)
-@pytest.mark.parametrize("others", [(), ("second",)], ids=["one", "several"])
+@pytest.mark.parametrize("others", ["", "second"], ids=["one", "several"])
 def test_changed_captures_are_kept_or_redone(capture, make_capture, run, reason, others):
     """One capture and several obey the same rules."""
     make_capture("second")
-    call = ("infer", capture, *others, "--method", "ls")
-    assert run(*call).code == 0
+    call = f"infer {capture} {others} --method ls"
+    run(call)
     extra = CHANGES[reason](capture)
     before = (Path("out/sphere/normals.npy").stat().st_mtime_ns, read_report(Path("out/sphere")))
-    kept = run(*call, *extra)
-    assert (kept.code, kept.out) == (5, "")
+    kept = run(f"{call} {extra}", code=5, out="")
     line = next(line for line in kept.err.splitlines() if "out/sphere: " in line)
     assert reason in line
     assert "Add --update to redo what changed, --overwrite to redo everything" in line
@@ -89,27 +87,26 @@ def test_changed_captures_are_kept_or_redone(capture, make_capture, run, reason,
         Path("out/sphere/normals.npy").stat().st_mtime_ns,
         read_report(Path("out/sphere")),
     ) == before
-    first, *_ = json.loads(run(*call, *extra, "--json").out)
+    first, *_ = run(f"{call} {extra} --json", code=5).json
     assert (first["capture"], first["exit_code"], reason in first["error"]) == ("sphere", 5, True)
-    updated = run(*call, *extra, "--update")
-    assert updated.code == 0
+    updated = run(f"{call} {extra} --update")
     assert Path("out/sphere/normals.npy").stat().st_mtime_ns > before[0]
     if others and not extra:
         assert "out/second: already done, skipped" in updated.err
-    assert run(*call, *extra).code == 0
+    run(f"{call} {extra}")
 
 
-def link_elsewhere(path: Path) -> None:
+def link_elsewhere(path):
     path.rename("elsewhere")
     path.symlink_to(Path("elsewhere").absolute())
 
 
-def surrogate_among_files(path: Path) -> None:
+def surrogate_among_files(path):
     report = read_json(path)
     path.write_text(json.dumps({**report, "files": ["\ud800"]}))
 
 
-UNFINISHED_FOLDERS: dict[str, tuple[str, Callable[[Path], object], str]] = {
+UNFINISHED_FOLDERS = {
     "no report": ("report.json", Path.unlink, "has no report.json"),
     "linked report": ("report.json", link_elsewhere, "has no report.json"),
     "missing": ("normals.png", Path.unlink, "normals.png is missing"),
@@ -125,15 +122,14 @@ UNFINISHED_FOLDERS: dict[str, tuple[str, Callable[[Path], object], str]] = {
 
 @pytest.mark.parametrize("name", UNFINISHED_FOLDERS)
 def test_an_unfinished_folder_is_computed_again(capture, run, name):
-    call = ("infer", capture, "--method", "ls")
-    assert run(*call).code == 0
+    call = f"infer {capture} --method ls"
+    run(call)
     whole = {path.name for path in Path("out/sphere").iterdir()}
     file, damage, reason = UNFINISHED_FOLDERS[name]
     damage(Path("out/sphere", file))
     elsewhere = {path: path.read_bytes() for path in Path().glob("elsewhere")}
-    again = run(*call)
-    assert (again.code, again.out[:11]) == (0, "out/sphere:")
-    assert reason in again.err and "so it is computed again" in again.err
+    again = run(call, says=(reason, "so it is computed again"))
+    assert again.out[:11] == "out/sphere:"
     assert {path.name for path in Path("out/sphere").iterdir()} == whole
     assert not any(path.is_symlink() for path in Path("out/sphere").iterdir())
     assert {path: path.read_bytes() for path in elsewhere} == elsewhere
@@ -143,21 +139,18 @@ def test_an_unfinished_folder_is_computed_again(capture, run, name):
         if path.suffix != ".json"
     }
     assert read_report(Path("out/sphere"))["file_sizes"] == sizes
-    assert "already done, skipped" in run(*call).err
+    run(call, says="already done, skipped")
 
 
 def test_an_edited_mask_and_an_integrated_surface_stay(capture, run):
     (capture / "mask.png").unlink()
-    call = ("infer", capture, "--method", "ls", "--auto-mask", "--surface")
-    assert run(*call, "--overwrite").code == 0
-    assert (
-        run("integrate", "out/sphere", "--format", "ply", "--discontinuity", 0, "--overwrite").code
-        == 0
-    )
-    assert run("integrate", "out/sphere", "--format", "ply", "--overwrite").code == 0
+    call = f"infer {capture} --method ls --auto-mask --surface"
+    run(f"{call} --overwrite")
+    run("integrate out/sphere --format ply --discontinuity 0 --overwrite")
+    run("integrate out/sphere --format ply --overwrite")
     with Path("out/sphere/found_mask.png").open("ab") as file:
         file.write(b"edited")
-    assert "already done, skipped" in run(*call).err
+    run(call, says="already done, skipped")
 
 
 def test_a_link_in_the_place_of_a_result_folder_fails_its_capture_only(capture, make_capture, run):
@@ -165,11 +158,12 @@ def test_a_link_in_the_place_of_a_result_folder_fails_its_capture_only(capture, 
     Path("elsewhere").mkdir()
     Path("out").mkdir()
     Path("out/sphere").symlink_to(Path("elsewhere").absolute())
-    for overwrite in ((), ("--overwrite",)):
-        result = run("infer", capture, "second", "--method", "ls", *overwrite)
-        assert (result.code, "out/sphere: found a link, expected a folder" in result.err) == (
-            5,
-            True,
+    for overwrite in ("", "--overwrite"):
+        run(
+            f"infer {capture} second --method ls",
+            *overwrite,
+            code=5,
+            says="out/sphere: found a link, expected a folder",
         )
         assert Path("out/second/report.json").is_file()
         assert not list(Path("elsewhere").iterdir())
@@ -194,26 +188,30 @@ BAD_REPORTS = [
 
 def test_bad_reports_of_other_captures_are_no_matter(capture, make_capture, run):
     names = [str(make_capture(f"c{number}")) for number in range(len(BAD_REPORTS))]
-    assert run("infer", *names, "--method", "ls").code == 0
+    run("infer --method ls", *names)
     Path("kept").touch()
     for name, (key, value) in zip(names, BAD_REPORTS, strict=True):
         path = Path("out", name, "report.json")
         path.write_text(json.dumps({**read_json(path), key: value}))
-    result = run("infer", capture, make_capture("third"), "--method", "ls")
-    assert (result.code, "Traceback" in result.err) == (0, False)
+    result = run(f"infer {capture} {make_capture('third')} --method ls")
+    assert "Traceback" not in result.err
     page = Path("out/index.html").read_text("utf-8")
     assert "sphere" in page and "third" in page
     # The same where the captures themselves come next.
-    assert run("infer", *names, "--method", "ls", "--update").code == 0
+    run("infer --method ls --update", *names)
     assert [read_json(Path("out", name, "report.json"))["capture"] for name in names] == names
     assert Path("kept").is_file()
 
 
 def test_files_of_the_user_in_the_capture_are_kept(capture, run):
     (capture / "normals.png").write_text("drawn by hand")
-    for update in ((), ("--update",)):
-        result = run("infer", capture, "--method", "ls", "-o", capture.parent, *update)
-        assert result.code == 5 and "sphere: contains normals.png, but no report.json" in result.err
+    for update in ("", "--update"):
+        run(
+            f"infer {capture} --method ls -o {capture.parent}",
+            *update,
+            code=5,
+            says="sphere: contains normals.png, but no report.json",
+        )
     assert (capture / "normals.png").read_text() == "drawn by hand"
 
 
@@ -248,9 +246,8 @@ def test_captures_are_computed_as_they_arrive_and_only_once(
     steps = [lambda: parts.rename("away"), lambda: None, lambda: Path("away").rename(parts)]
     copy = partial(shutil.copytree, capture, parts / "-first 1")
     look([*steps, copy, lambda: (parts / "-first 1/done").touch()])
-    command = ("watch", parts, "--marker", "done", "--", "--method", "ls", "--jsonl", "-o", "out")
-    result = run(*command)
-    assert result.code == 130
+    command = f"watch {parts} --marker done -- --method ls --jsonl -o out"
+    result = run(command, code=130, says="parts: the folder is there again")
     failed, again, done = map(json.loads, result.out.splitlines())
     assert (failed["capture"], failed["exit_code"]) == ("bad", 3) and again == failed
     assert (
@@ -259,11 +256,10 @@ def test_captures_are_computed_as_they_arrive_and_only_once(
         )
         == 1
     )
-    assert "parts: the folder is there again" in result.err
     assert (done["capture"], done["method"]) == ("-first 1", "ls")
     before = Path("out/-first 1/report.json").stat().st_mtime_ns
     look([])
-    assert "out/-first 1: already done, skipped" in run(*command).err
+    run(command, code=130, says="out/-first 1: already done, skipped")
     assert Path("out/-first 1/report.json").stat().st_mtime_ns == before
 
 
@@ -271,27 +267,24 @@ def test_an_interruption_of_a_capture_ends_it(run, capture, monkeypatch):
     Path("parts").mkdir()
     capture.rename("parts/sphere")
     monkeypatch.setattr("splinecli.pipeline.batch.run_member", Mock(side_effect=KeyboardInterrupt))
-    result = run("watch", "parts", "--settle", 0, "--", "--method", "ls")
-    assert result.code == 130 and "interrupted" in result.err
+    run("watch parts --settle 0 -- --method ls", code=130, says="interrupted")
 
 
-@pytest.mark.parametrize(
-    ("options", "problem"),
-    [
-        (("--json",), "--json prints one list at the end, and watch has none"),
-        (("--shard", "1/2"), "--shard splits a list of captures"),
-        (("other",), "found other after the dashes, expected options of infer"),
-        (("-o", "sphere/../sphere"), "the results would be among the captures"),
-        (("--methd", "ls"), "no option --methd"),
-        (("--method", "lss"), "no method named 'lss'"),
-        (("--overwrite", "--update"), "contradict each other"),
-    ],
-)
+REFUSED_OPTIONS = """
+--json | --json prints one list at the end, and watch has none
+--shard 1/2 | --shard splits a list of captures
+other | found other after the dashes, expected options of infer
+-o sphere/../sphere | the results would be among the captures
+--methd ls | no option --methd
+--method lss | no method named 'lss'
+--overwrite --update | contradict each other
+"""
+
+
+@pytest.mark.parametrize("options, problem", table(REFUSED_OPTIONS))
 def test_wrong_options_are_refused(run, capture, options, problem):
-    result = run("watch", capture, "--settle", 0, "--", *options)
-    assert result.code == 2 and problem in result.err
+    run(f"watch {capture} --settle 0 -- {options}", code=2, says=problem)
 
 
 def test_no_folder(run, capture):
-    result = run("watch", "nowhere")
-    assert result.code == 3 and "nowhere: the folder cannot be read" in result.err
+    run("watch nowhere", code=3, says="nowhere: the folder cannot be read")

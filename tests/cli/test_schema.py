@@ -2,9 +2,7 @@
 describes.
 """
 
-import json
 from pathlib import Path
-from typing import Any
 
 import jsonschema
 import pytest
@@ -16,7 +14,7 @@ from splinecli.records.documents import json_schema
 SCHEMA = read_json(Path(__file__).resolve().parents[2] / "docs/reports.schema.json")
 
 
-def check(document: Any, name: str) -> None:
+def check(document, name):
     """Raise ValidationError if the document is not what the definition `name` of the schema
     says.
     """
@@ -27,12 +25,12 @@ def check(document: Any, name: str) -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["--method", "ls", "--surface", "--maps", "albedo"],
-        ["--method", "spline-net-pixelwise", "--light-indices", "0,1,2,3"],
+        "--method ls --surface --maps albedo",
+        "--method spline-net-pixelwise --light-indices 0,1,2,3",
     ],
 )
 def test_reports_of_infer(capture, run, arguments):
-    [printed] = json.loads(run("infer", capture, *arguments, "--json").out)
+    [printed] = run(f"infer {capture} --json {arguments}").json
     written = read_json("out/sphere/report.json")
     assert printed == written
     check(written, "Report")
@@ -43,18 +41,14 @@ def test_reports_of_infer(capture, run, arguments):
 
 
 def test_reports_of_integrate(capture, run):
-    assert run("infer", capture, "--method", "ls").code == 0
-    check(
-        json.loads(run("integrate", "out/sphere", "--pixel-size", 2, "--json").out), "SurfaceReport"
-    )
+    run(f"infer {capture} --method ls")
+    check(run("integrate out/sphere --pixel-size 2 --json").json, "SurfaceReport")
 
 
-@pytest.mark.parametrize("lights", [["4"], ["4", "all"]])
+@pytest.mark.parametrize("lights", ["--n-lights 4", "--n-lights 4 --n-lights all"])
 def test_results_of_evaluate(make_capture, run, lights):
     make_capture("data/matte")
-    chosen = [word for number in lights for word in ("--n-lights", number)]
-    arguments = ("--method", "ls", "--method", "l1", *chosen, "--trials", 2)
-    document = json.loads(run("evaluate", "data", *arguments, "--json").out)
+    document = run(f"evaluate data --json --method ls --method l1 {lights} --trials 2").json
     assert document == read_json("evaluation/results.json")
     check(document, "Results")
     for change in ({"colour": 1}, {"averages": {"ls": "good"}}):

@@ -4,7 +4,6 @@ import csv
 import os
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -30,7 +29,7 @@ def small_runs(monkeypatch):
     monkeypatch.setattr(tasks, "VALIDATION_PIXELS", 32)
 
 
-def steps() -> list[str]:
+def steps():
     with Path("run/metrics.csv").open(encoding="utf-8", newline="") as file:
         return [row["step"] for row in csv.DictReader(file)]
 
@@ -38,11 +37,11 @@ def steps() -> list[str]:
 SAVED = {"weights.safetensors", "checkpoint.safetensors", "config.json", "metrics.csv"}
 
 
-def settings() -> dict[str, Any]:
+def settings():
     return read_json("run/config.json")
 
 
-def write_set(folder: str, *, finished: bool = True) -> None:
+def write_set(folder, *, finished=True):
     """Matte pixels in three scenes under 14 lights."""
     from splinecli.workshop.pixel_sets.store import PixelSetWriter
 
@@ -54,15 +53,15 @@ def write_set(folder: str, *, finished: bool = True) -> None:
 
 
 def test_a_run_and_its_continuation(run, monkeypatch):
-    result = run("train", "-o", "run", "--steps", 3)
-    assert (result.code, result.out) == (0, "run/weights.safetensors\n")
-    assert "step 3, 48 pixels" in result.err
+    result = run(
+        "train -o run --steps 3", says="step 3, 48 pixels", out="run/weights.safetensors\n"
+    )
     assert {path.name for path in Path("run").iterdir()} == SAVED | {"curves.png", "maps.png"}
     assert settings()["steps"] == 3
     assert settings()["sources"] == {"generator": 1.0}
     assert steps() == ["3"]
     monkeypatch.setattr(RunLog, "draw", lambda self, maps: None)
-    assert run("train", "-o", "run", "--resume", "--steps", 5, "--quiet") == type(result)(0, "", "")
+    assert run("train -o run --resume --steps 5 --quiet") == type(result)(0, "", "")
     assert steps() == ["3", "5"]
     # A name that is not UTF-8, which the library of the weights does not take.
     other = os.fsdecode(b"r\xffn")
@@ -70,21 +69,18 @@ def test_a_run_and_its_continuation(run, monkeypatch):
         Path("run").rename(other)
     except OSError:
         pytest.skip("the file system has no such names")
-    assert run("train", "-o", other, "--resume", "--steps", 5, "--quiet").code == 0
+    run(f"train -o {other} --resume --steps 5 --quiet")
     Path(other).rename("run")
     # Settings may be repeated if they are those of the run.
-    again = ["--resume", "--steps", 6, "--preset", "compact", "--seed", 0, "--quiet"]
-    assert run("train", "-o", "run", *again).code == 0
+    again = "--resume --steps 6 --preset compact --seed 0 --quiet"
+    run(f"train -o run {again}")
     assert steps() == ["3", "5", "6"]
 
 
 def test_a_run_on_pixel_sets(run, document, no_pictures, make_capture):
     write_set("set")
     write_set("more/set")
-    result = run(
-        "train", "set", "more/set", "-o", "run", "--n-lights", "4-8", "--steps", 4, "--seed", 5
-    )
-    assert result.code == 0, result.err
+    run("train set more/set -o run --n-lights 4-8 --steps 4 --seed 5")
     assert {path.name for path in Path("run").iterdir()} == SAVED
     values = settings()
     # A run continues from another working folder.
@@ -94,47 +90,39 @@ def test_a_run_on_pixel_sets(run, document, no_pictures, make_capture):
     }
     lights = [values["pixels"][name] for name in ("min_lights", "max_lights", "usual_lights")]
     assert (lights, values["seed"]) == ([4, 8, 8], 5)
-    report = document("infer", make_capture("sphere"), "--weights", "run/weights.safetensors")
+    report = document(f"infer {make_capture('sphere')} --weights run/weights.safetensors")
     assert report["angular_error_deg"]["mean"] < 10
     # First from the same folder, then from another.
-    assert run("train", "-o", "run", "--resume", "--steps", 5, "--quiet").code == 0
+    run("train -o run --resume --steps 5 --quiet")
     Path("elsewhere").mkdir()
     os.chdir("elsewhere")
-    assert run("train", "-o", "../run", "--resume", "--steps", 6, "--quiet").code == 0
+    run("train -o ../run --resume --steps 6 --quiet")
 
 
 def test_settings_come_from_preset_file_and_options(run, no_pictures):
     Path("a.toml").write_text(
         "seed = 4\nbatch_size = 8\n[pixels]\nwall_share = 0.25\nmax_lights = 20\n"
     )
-    options = [
-        "--param",
-        "batch_size=4",
-        "--param",
-        "pixels.ambient_share=0",
-        "--n-lights",
-        12,
-        "--steps",
-        1,
-    ]
-    assert run("train", "-o", "run", "--config", "a.toml", *options, "--quiet").code == 0
+    options = "--param batch_size=4 --param pixels.ambient_share=0 --n-lights 12 --steps 1"
+    run(f"train -o run --config a.toml {options} --quiet")
     values = settings()
     assert (values["seed"], values["batch_size"], values["steps"]) == (4, 4, 1)
     assert (values["pixels"]["wall_share"], values["pixels"]["ambient_share"]) == (0.25, 0)
     assert (values["pixels"]["min_lights"], values["pixels"]["max_lights"]) == (12, 12)
     # The configuration of one run starts another.
-    assert (
-        run("train", "-o", "other", "--config", "run/config.json", "--seed", 9, "--quiet").code == 0
-    )
+    run("train -o other --config run/config.json --seed 9 --quiet")
     assert read_json("other/config.json") == values | {"seed": 9}
 
 
 def test_tensorboard_is_an_extra(run, no_pictures, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboard", None)
     monkeypatch.delitem(sys.modules, "torch.utils.tensorboard", raising=False)
-    result = run("train", "-o", "run", "--steps", 1, "--tensorboard")
-    assert (result.code, result.out) == (2, "")
-    assert "--tensorboard needs the package tensorboard" in result.err
+    result = run(
+        "train -o run --steps 1 --tensorboard",
+        code=2,
+        says="--tensorboard needs the package tensorboard",
+        out="",
+    )
     assert result.err.endswith("Run pip install 'splinecli[tensorboard]'.\n")
 
 
@@ -144,27 +132,24 @@ def test_processes_that_cannot_share_a_batch(run, monkeypatch):
     monkeypatch.setattr(
         training_run, "join_workers", lambda device: (training_run.Workers(0, 3), device)
     )
-    result = run("train", "-o", "run", "--steps", 1)
-    assert (result.code, result.out) == (2, "")
-    assert "3 processes cannot share the 4 shards" in result.err
+    run("train -o run --steps 1", code=2, says="3 processes cannot share the 4 shards", out="")
     assert not Path("run").exists()
 
 
 def test_a_restarted_worker_continues_by_itself(run, no_pictures, monkeypatch):
-    assert run("train", "-o", "run", "--steps", 3, "--quiet").code == 0
+    run("train -o run --steps 3 --quiet")
     monkeypatch.setattr("splinecli.workshop.training.loop.restarts_are_allowed", lambda: True)
-    assert run("train", "-o", "run", "--steps", 5, "--quiet").code == 0
+    run("train -o run --steps 5 --quiet")
     assert steps() == ["3", "5"]
     # Without a checkpoint, a run starts.
-    assert run("train", "-o", "other", "--steps", 1, "--quiet").code == 0
+    run("train -o other --steps 1 --quiet")
 
 
 def test_resuming_a_finished_run_says_so(run, no_pictures):
-    run("train", "-o", "run", "--steps", 1)
+    run("train -o run --steps 1")
     before = {path.name: path.read_bytes() for path in Path("run").iterdir()}
     Path("run", f".weights.safetensors.x{UNFINISHED}").touch()  # a killed process was writing this
-    result = run("train", "-o", "run", "--resume", "--steps", 1)
-    assert (result.code, result.out) == (0, "run/weights.safetensors\n")
+    result = run("train -o run --resume --steps 1", out="run/weights.safetensors\n")
     warning, message = result.err.splitlines()
     assert warning == f"splinecli: warning: run: {UNDONE}"
     assert message.startswith("run: the run is at its end already.")
@@ -175,21 +160,19 @@ def test_resuming_a_finished_run_says_so(run, no_pictures):
     "damage", [b"\xff\xfe\x00", b"step,pixels\n1,2\n3,4\n", b"\x00" * 50 + b"\n1,2\n"]
 )
 def test_a_damaged_log_is_kept_aside(run, no_pictures, damage):
-    assert run("train", "-o", "run", "--steps", 1, "-q").code == 0
+    run("train -o run --steps 1 -q")
     damaged = Path("run/metrics.csv").read_bytes() + damage
     Path("run/metrics.csv").write_bytes(damaged)
-    result = run("train", "-o", "run", "--resume", "--steps", 2)
-    assert result.code == 0
-    assert (
-        "splinecli: warning: metrics.csv was damaged and is now run/metrics.damaged.csv"
-        in result.err
+    run(
+        "train -o run --resume --steps 2",
+        says="splinecli: warning: metrics.csv was damaged and is now run/metrics.damaged.csv",
     )
     assert Path("run/metrics.damaged.csv").read_bytes() == damaged
     assert steps() == ["2"]
 
 
 def test_refusals(run, refuse, no_pictures):
-    run("train", "-o", "run", "--steps", 1)
+    run("train -o run --steps 1")
     Path("unknown.toml").write_text("[pixels]\nlights = 5\n")
     Path("broken.toml").write_text("steps =\n")
     write_set("set")
@@ -199,35 +182,39 @@ def test_refusals(run, refuse, no_pictures):
     content = normals.read_bytes()
     normals.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     Path("empty").mkdir()
-    cases = (
-        (5, ["-o", "run"]),
-        (4, ["-o", "other", "--resume"]),
-        (2, ["-o", "other", "--preset", "huge"]),
-        (2, ["-o", "other", "--steps", 1, "--minutes", 1]),
-        (2, []),
+    cases = """
+        5 -o run
+        4 -o other --resume
+        2 -o other --preset huge
+        2 -o other --steps 1 --minutes 1
+        2
         # settings
-        (4, ["-o", "other", "--param", "sead=1"]),
-        (4, ["-o", "other", "--param", "network.widht=8"]),
-        (4, ["-o", "other", "--param", "updates=both"]),
-        (4, ["-o", "other", "--param", "batch_size=6"]),
-        (2, ["-o", "other", "--param", "seed"]),
-        (4, ["-o", "other", "--config", "unknown.toml"]),
-        (4, ["-o", "other", "--config", "broken.toml"]),
-        (4, ["-o", "other", "--config", "none.toml"]),
-        (4, ["-o", "other", "--generator-weight", 0]),
-        (4, ["-o", "other", "--start-from", "nowhere"]),
-        (4, ["-o", "other", "--start-from", "cnn-ps"]),
-        *((2, ["-o", "other", f"--n-lights={text}"]) for text in ("few", "2", "9-4", "4-", "")),
+        4 -o other --param sead=1
+        4 -o other --param network.widht=8
+        4 -o other --param updates=both
+        4 -o other --param batch_size=6
+        2 -o other --param seed
+        4 -o other --config unknown.toml
+        4 -o other --config broken.toml
+        4 -o other --config none.toml
+        4 -o other --generator-weight 0
+        4 -o other --start-from nowhere
+        4 -o other --start-from cnn-ps
+        2 -o other --n-lights=few
+        2 -o other --n-lights=2
+        2 -o other --n-lights=9-4
+        2 -o other --n-lights=4-
+        2 -o other --n-lights=
         # another run's checkpoint
-        (4, ["-o", "run", "--resume", "--steps", 2, "--param", "network.size=paper"]),
-        (4, ["-o", "run", "--resume", "--steps", 2, "--seed", 1]),
-        (4, ["-o", "run", "--resume", "--steps", 2, "--n-lights", 10]),
+        4 -o run --resume --steps 2 --param network.size=paper
+        4 -o run --resume --steps 2 --seed 1
+        4 -o run --resume --steps 2 --n-lights 10
         # sets
-        (3, ["missing", "-o", "other"]),
-        (3, ["empty", "-o", "other"]),
-        (3, ["unfinished", "-o", "other"]),
-        (3, ["set", "changed", "-o", "other"]),
-    )
-    refuse("train", cases, "train_refusals.txt")
+        3 missing -o other
+        3 empty -o other
+        3 unfinished -o other
+        3 set changed -o other
+    """
+    refuse("train", cases)
     assert not Path("other").exists()
     assert steps() == ["1"]

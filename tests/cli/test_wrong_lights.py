@@ -2,7 +2,6 @@
 makes them errors.
 """
 
-import json
 from pathlib import Path
 
 import cv2
@@ -11,51 +10,59 @@ import pytest
 from numpy.testing import assert_allclose
 
 from cli.conftest import EXAMPLE, read_report
-from scenes import BUMP_LAMPS, read_image, to_uint16, write_bump, write_image
+from scenes import BUMP_LAMPS, codes, read_image, to_uint16, write_bump, write_image
+from splinecli.maths.normals import unit
 
 
-def write_lights(folder: Path, change) -> None:
+def write_lights(folder, change):
     lights = np.loadtxt(EXAMPLE / "light_directions.txt")
     np.savetxt(folder / "light_directions.txt", change(lights), fmt="%.6f")
 
 
 def test_a_flipped_axis_is_mended_unless_a_frame_is_given(run, medallion):
     write_lights(medallion, lambda lights: lights * (1, -1, 1))
-    found = {}
-    for frame in ("as they come", "x-right,y-up", "y-down"):
-        options = [] if frame == "as they come" else ["--light-frame", frame]
-        found[frame] = run("infer", medallion, "--method", "ls", *options, "--overwrite")
-        report = read_report(Path("out/medallion"))
-        found[frame] = (found[frame], report["angular_error_deg"]["mean"], report["mended"])
     why = "with y negated (curl 0.03 against 0.52, outline +1.00 against -0.00). "
+    found = {}
+    for options, says in (
+        ("", f"{why}They were corrected; --light-frame x-right,y-up keeps"),
+        ("--light-frame x-right,y-up", f"{why}Run again with --light-frame y-down."),
+        ("--light-frame y-down", ""),
+    ):
+        run(f"infer {medallion} --method ls --overwrite {options}", says=says)
+        report = read_report(Path("out/medallion"))
+        found[options] = report["angular_error_deg"]["mean"], report["mended"], codes(report)
     mended, kept, given = found.values()
-    assert f"{why}They were corrected; --light-frame x-right,y-up keeps" in mended[0].err
-    assert f"{why}Run again with --light-frame y-down." in kept[0].err
-    assert given[0].err == ""
-    assert [each[0].code for each in found.values()] == [0, 0, 0]
-    assert mended[1] == given[1] < kept[1] / 5
-    assert (mended[2], kept[2], given[2]) == (["light_frame"], [], [])
-    refused = run("infer", medallion, "--method", "ls", "--strict", "--overwrite")
-    assert refused.code == 3 and "Leave --strict out to go on with this corrected." in refused.err
+    assert mended[0] == given[0] < kept[0] / 5
+    assert mended[1:] == (["light_frame"], ["lights_mended"])
+    assert (kept[1:], given[1:]) == (([], ["light_frame"]), ([], []))
+    says = "Leave --strict out to go on with this corrected."
+    run(f"infer {medallion} --method ls --strict --overwrite", code=3, says=says)
 
 
 def test_lights_that_all_point_away(run, medallion):
     write_lights(medallion, lambda lights: -lights)
-    result = run("infer", medallion, "--method", "ls")
-    assert result.code == 3
-    assert "z points away from the camera in this file: add --light-frame z-away" in result.err
+    run(
+        f"infer {medallion} --method ls",
+        code=3,
+        says="z points away from the camera in this file: add --light-frame z-away",
+    )
 
 
 def test_strict_writes_nothing_and_ends_with_3(run, medallion):
     write_lights(medallion, lambda lights: np.roll(lights, 1, axis=0))
-    result = run("infer", medallion, "--method", "ls", "--strict")
-    assert (result.code, result.out) == (3, "")
-    assert "much better if image 1 belongs to light 2, image 2 to the next, and so on" in result.err
-    assert "Leave --strict out to go on with this corrected." in result.err
+    run(
+        f"infer {medallion} --method ls --strict",
+        code=3,
+        says=(
+            "much better if image 1 belongs to light 2, image 2 to the next, and so on",
+            "Leave --strict out to go on with this corrected.",
+        ),
+        out="",
+    )
     assert not Path("out/medallion").exists()
 
 
-@pytest.mark.parametrize("options", [(), ("--intensities", "equal")])
+@pytest.mark.parametrize("options", ["", "--intensities equal"])
 def test_an_order_is_named_although_the_intensities_are_unequal_and_unknown(
     run, medallion, options
 ):
@@ -63,20 +70,19 @@ def test_an_order_is_named_although_the_intensities_are_unequal_and_unknown(
     for number in (3, 7, 8):
         path = str(medallion / f"{number:02}.png")
         cv2.imwrite(path, to_uint16(0.6 * cv2.imread(path, cv2.IMREAD_UNCHANGED)))
-    for command in (("info", medallion), ("infer", medallion, "--method", "ls")):
-        assert "light" not in run(*command, *options).err.replace(
+    for command in (f"info {medallion}", f"infer {medallion} --method ls"):
+        assert "light" not in run(f"{command} {options}").err.replace(
             "The light intensities were estimated", ""
         )
     write_lights(medallion, lambda lights: lights[[0, 5, 2, 3, 4, 1, 6, 7, 8, 9]])
-    for command in (("info", medallion), ("infer", medallion, "--method", "ls", "--overwrite")):  # type: ignore[assignment]
-        found = run(*command, *options).err
+    for command in (f"info {medallion}", f"infer {medallion} --method ls --overwrite"):
+        found = run(f"{command} {options}").err
         assert "much better with the lights of 02.png and 06.png exchanged (misfit" in found
 
 
 def test_info_lists_the_readings(run, medallion):
-    good = run("info", medallion, "--strict", "--check-lights", "--json")
-    assert good.code == 0
-    rows = json.loads(good.out)["light_candidates"]
+    good = run(f"info {medallion} --strict --check-lights --json")
+    rows = good.json["light_candidates"]
     assert rows[0]["reading"] == "as given"
     assert rows[0]["rim"] > 0.99 and max(row["advantage"] or 0 for row in rows) == 0
     assert len(rows) >= 12
@@ -84,56 +90,52 @@ def test_info_lists_the_readings(run, medallion):
     assert set(orders) == {"if", "in", "with"}
     assert min(orders.values()) > rows[0]["misfit"]
     write_lights(medallion, lambda lights: lights[:, [1, 0, 2]])
-    wrong = run("info", medallion, "--strict", "--check-lights")
-    assert wrong.code == 3 and "--light-frame swap-xy" in wrong.err
+    wrong = run(
+        f"info {medallion} --strict --check-lights",
+        code=3,
+        says=(
+            "--light-frame swap-xy",
+            "splinecli: medallion: an input is probably wrong (light_frame), as the warnings say",
+        ),
+    )
     assert "x and y exchanged  " in wrong.out
     assert "in reversed order, beginning with light" in wrong.out
     assert "advantage: evidence from curl and outline" in wrong.out
-    assert (
-        f"splinecli: {medallion}: an input is probably wrong (light_frame), as the warnings say"
-        in wrong.err
-    )
 
 
 def test_mended_lights(run, medallion):
     """What is written needs no frame and no other order."""
     right = np.loadtxt(medallion / "light_directions.txt")
-    good = run("info", medallion, "--mended-lights", "mended.txt")
-    assert (good.code, Path("mended.txt").exists()) == (0, False)
+    good = run(f"info {medallion} --mended-lights mended.txt")
+    assert not Path("mended.txt").exists()
     assert "not written: no other reading of the lights fits clearly better" in good.out
     write_lights(medallion, lambda lights: np.roll(lights, 2, axis=0)[:, [1, 0, 2]])
-    report = json.loads(run("info", medallion, "--mended-lights", "mended.txt", "--json").out)
+    report = run(f"info {medallion} --mended-lights mended.txt --json").json
     assert report["mended_lights"] == "mended.txt"
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     assert_allclose(np.loadtxt("mended.txt"), right, atol=1e-6)
-    assert run("info", medallion, "--mended-lights", "mended.txt").code == 5
-    assert run("infer", medallion, "--lights", "mended.txt", "--method", "ls", "--strict").code == 0
+    run(f"info {medallion} --mended-lights mended.txt", code=5)
+    run(f"infer {medallion} --lights mended.txt --method ls --strict")
     for name in ("mended.lp", "mended.npy"):
-        assert run("info", medallion, "--mended-lights", name).code == 0
-        again = run(
-            "infer", medallion, "--lights", name, "--method", "ls", "--strict", "-o", name[-3:]
-        )
-        assert (again.code, again.err) == (0, "")
+        run(f"info {medallion} --mended-lights {name}")
+        run(f"infer {medallion} --lights {name} --method ls --strict -o {name[-3:]}", err="")
         assert_allclose(
             read_report(Path(name[-3:], "medallion"))["light_directions"], right, atol=1e-5
         )
     for suffix in ("json", "mat", "yml", "xml"):
-        refused = run("info", medallion, "--mended-lights", f"mended.{suffix}")
-        assert (
-            refused.code,
-            f"of the type .{suffix} are only read. Write .txt" in refused.err,
-        ) == (2, True)
+        run(
+            f"info {medallion} --mended-lights mended.{suffix}",
+            code=2,
+            says=f"of the type .{suffix} are only read. Write .txt",
+        )
         assert not Path(f"mended.{suffix}").exists()
 
 
 def test_what_cannot_be_checked_is_said_and_no_error(run, medallion):
-    usual = run("infer", medallion, "--method", "ls", "--light-indices", "0,2,4,6,8", "-o", "usual")
-    assert usual.code == 0 and "not be checked" not in usual.err
-    few = run(
-        "infer", medallion, "--method", "ls", "--light-indices", "0,2,4,6,8", "--strict", "--json"
-    )
-    assert few.code == 0
-    warning, other = json.loads(few.out)[0]["warnings"]
+    usual = run(f"infer {medallion} --method ls --light-indices 0,2,4,6,8 -o usual")
+    assert "not be checked" not in usual.err
+    few = run(f"infer {medallion} --method ls --light-indices 0,2,4,6,8 --strict --json")
+    warning, other = few.json[0]["warnings"]
     assert (warning["code"], other["code"]) == ("lights_unchecked", "few_lights")
     assert warning["text"].endswith(
         "their order (fewer than 6 lights, too few lit pixels, or a flat object)."
@@ -143,11 +145,10 @@ def test_what_cannot_be_checked_is_said_and_no_error(run, medallion):
     write_image(medallion / "mask.png", mask)
     (medallion / "normals_gt.png").unlink()  # it would contradict the lights
     write_lights(medallion, lambda lights: lights * (-1, -1, 1))
-    relief = run("info", medallion, "--strict")
-    assert relief.code == 0
-    assert (
-        "The lights of light_directions.txt could not be fully verified. Unchecked: whether x and y"
-        in relief.err
+    run(
+        f"info {medallion} --strict",
+        says="The lights of light_directions.txt could not be fully verified. Unchecked: whether x"
+        " and y",
     )
 
 
@@ -157,10 +158,15 @@ def test_angles_from_the_camera_axis_are_told_by_the_images(run, medallion):
         return np.degrees(np.stack((azimuth, np.arccos(lights[:, 2])), axis=1))
 
     write_lights(medallion, zenith_angles)
-    result = run("info", medallion, "--light-format", "azel", "--strict", "--json")
-    assert result.code == 3 and json.loads(result.out)["warning_codes"] == ["light_frame"]
-    assert "much better if their elevations count from the camera axis (misfit" in result.err
-    assert "Replace each elevation by 90 degrees minus it." in result.err
+    result = run(
+        f"info {medallion} --light-format azel --strict --json",
+        code=3,
+        says=(
+            "much better if their elevations count from the camera axis (misfit",
+            "Replace each elevation by 90 degrees minus it.",
+        ),
+    )
+    assert result.json["warning_codes"] == ["light_frame"]
 
 
 def test_a_file_of_all_intensities_fits_a_light_file_that_names_some_images(run, medallion):
@@ -174,7 +180,7 @@ def test_a_file_of_all_intensities_fits_a_light_file_that_names_some_images(run,
     normals = []
     for content in (rows, [rows[i] for i in chosen]):
         intensities.write_text("\n".join(content))
-        assert run("infer", medallion, "--method", "ls", "--overwrite").code == 0
+        run(f"infer {medallion} --method ls --overwrite")
         normals.append(np.load("out/medallion/normals.npy"))
     np.testing.assert_array_equal(*normals)
 
@@ -182,48 +188,45 @@ def test_a_file_of_all_intensities_fits_a_light_file_that_names_some_images(run,
 def test_an_image_that_contradicts_the_others_is_named(run, medallion):
     picture = read_image(medallion / "07.png")
     write_image(medallion / "07.png", (picture * 0.4).astype(picture.dtype))
-    result = run("info", medallion, "--strict", "--json")
-    assert result.code == 3
-    report = json.loads(result.out)
+    result = run(f"info {medallion} --strict --json", code=3)
+    report = result.json
     assert report["warning_codes"] == ["image_inconsistent"]
     assert "07.png contradicts the other images and is 0.4" in report["warnings"][0]
     left_out = ",".join(str(place) for place in range(10) if place != 6)
-    assert (
-        run("infer", medallion, "--method", "ls", "--strict", "--light-indices", left_out).code == 0
-    )
+    run(f"infer {medallion} --method ls --strict --light-indices {left_out}")
 
 
 @pytest.fixture
-def rough() -> np.ndarray:
+def rough():
     """Write a matte bump under distant lights. Returns directions (7, 3) with errors of about 5
     degrees.
     """
     write_bump(Path("bump"), distant=True)
-    directions = BUMP_LAMPS / np.linalg.norm(BUMP_LAMPS, axis=1, keepdims=True)
+    directions = unit(BUMP_LAMPS)
     Path("bump/light_intensities.txt").write_text("1\n" * len(directions))
     rough = directions + np.random.default_rng(1).normal(scale=0.06, size=directions.shape)
     np.savetxt("bump/light_directions.txt", rough)
-    return rough / np.linalg.norm(rough, axis=1, keepdims=True)
+    return unit(rough)
 
 
 def test_infer(document, rough):
-    command = ("infer", "bump", "--method", "ls", "--overwrite")
-    given, refined = (document(*command, *more) for more in ((), ("--refine-lights",)))
+    command = "infer bump --method ls --overwrite"
+    given, refined = (document(f"{command} {more}") for more in ("", "--refine-lights"))
     assert_allclose(given["light_directions"], rough, atol=1e-5)
     moved = np.degrees(
         np.arccos((np.array(refined["light_directions"]) * rough).sum(axis=1).clip(-1, 1))
     )
     assert 1 < moved.mean() < 10
-    assert "refined_lights" in [warning["code"] for warning in refined["warnings"]]
+    assert "refined_lights" in codes(refined)
     # A common rotation of lights and normals stays.
     assert refined["angular_error_deg"]["mean"] < 0.9 * given["angular_error_deg"]["mean"]
 
 
 def test_evaluate(document, rough):
     """Both protocols share a folder: trials with refined lights are other trials."""
-    command = ("evaluate", "bump", "--method", "ls", "--n-lights", "all", "-o", "scores")
-    options = ((), ("--refine-lights",), ("--refine-lights", "--light-error-deg", "3"))
-    found = [document(*command, *more) for more in options]
+    command = "evaluate bump --method ls --n-lights all -o scores"
+    options = ("", "--refine-lights", "--refine-lights --light-error-deg 3")
+    found = [document(f"{command} {more}") for more in options]
     errors = [one["results"][0]["mae_deg"] for one in found]
     assert found[2]["protocol"]["light_error_deg"] == 3
     assert errors[1] < 0.9 * errors[0]
@@ -234,18 +237,24 @@ def test_evaluate_skips_a_capture_with_near_lamps(run, rough):
     write_bump(Path("near"))
     np.savetxt("near/light_positions.txt", BUMP_LAMPS)
     Path("near/pixel_size.txt").write_text("2\n")
-    arguments = ["--method", "ls", "--n-lights", "all", "--refine-lights", "--json"]
-    result = run("evaluate", "bump", "near", *arguments)
-    document = json.loads(result.out)
+    arguments = "--method ls --n-lights all --refine-lights --json"
+    result = run(
+        f"evaluate bump near {arguments}",
+        code=3,
+        says="--refine-lights refines distant lights, and this capture has near lamps",
+    )
+    document = result.json
     assert [scored["capture"] for scored in document["results"]] == ["bump"]
     assert [skipped["capture"] for skipped in document["skipped"]] == ["near"]
-    assert "--refine-lights refines distant lights, and this capture has near lamps" in result.err
-    assert run("evaluate", "near", *arguments).code == 2
+    run(f"evaluate near {arguments}", code=2)
 
 
 def test_a_light_error_without_refined_lights_is_refused(run, rough):
-    result = run("evaluate", "bump", "--method", "ls", "--light-error-deg", "4")
-    assert (result.code, "--light-error-deg needs --refine-lights" in result.err) == (2, True)
+    run(
+        "evaluate bump --method ls --light-error-deg 4",
+        code=2,
+        says="--light-error-deg needs --refine-lights",
+    )
 
 
 def test_a_black_patch_amid_the_object(run, medallion):
@@ -254,8 +263,5 @@ def test_a_black_patch_amid_the_object(run, medallion):
         image = read_image(path)
         image[54:74, 54:74] = 0
         write_image(path, image)
-    result = run("infer", medallion, "--method", "ls")
-    assert result.code == 0
-    assert "black_pixels" in [
-        warning["code"] for warning in read_report(Path("out/medallion"))["warnings"]
-    ]
+    run(f"infer {medallion} --method ls")
+    assert "black_pixels" in codes(read_report(Path("out/medallion")))

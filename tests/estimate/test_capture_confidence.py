@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose
-from numpy.typing import NDArray
 
 from scenes import directions_at
 from splinecli.capture import Capture
 from splinecli.estimate.confidence import CaptureFeatures, capture_features
-from splinecli.estimate.inference import NormalEstimate, estimate_normals
+from splinecli.estimate.inference import estimate_normals
 from splinecli.estimate.methods import make_estimator
 from splinecli.estimate.networks.li_ne_net import CAPTURE_FEATURES, PIXEL_FEATURES, CaptureHead
 from splinecli.estimate.networks.weights import capture_head, manifest
@@ -19,17 +18,15 @@ from splinecli.lights.lighting import PixelLighting
 from splinecli.maths.normals import unit
 from splinecli.maths.transfer import encode_srgb
 
-Float64Array = NDArray[np.float64]
 SIZE = 40
-WIDTH = float(SIZE)
 
 
-def draw_lights(count: int = 12) -> Float64Array:
+def draw_lights(count=12):
     rng = np.random.default_rng(1)
     return directions_at(np.arange(count) * 2.4, np.arccos(rng.uniform(0.5, 0.95, count)))
 
 
-def relief(lights: Float64Array, *, widths: float | None = None) -> Capture:
+def relief(lights, *, widths=None):
     """Return a matte relief without cast shadows, under distant lights, or under lamps so many
     widths away.
     """
@@ -57,16 +54,16 @@ def relief(lights: Float64Array, *, widths: float | None = None) -> Capture:
     )
 
 
-def encoded(capture: Capture) -> Capture:
+def encoded(capture):
     values = encode_srgb(capture.observations / capture.observations.max()) / np.float32(255)
     return replace(capture, observations=values)
 
 
-def features(capture: Capture) -> CaptureFeatures:
+def features(capture):
     normals = capture.ground_truth[capture.mask]
     errors = np.tile(np.float32((-3, 1)), (len(normals), 1))
 
-    def lighting_at(rows: NDArray[np.integer]) -> PixelLighting:
+    def lighting_at(rows):
         return PixelLighting(capture.observations[rows], capture.light_directions)
 
     found = capture_features(capture.mask, lighting_at, normals, errors, capture.light_directions)
@@ -113,7 +110,7 @@ def test_an_untrained_head_changes_little():
     np.testing.assert_array_equal(found[:, 1].detach(), errors[:, 1])
 
 
-def claim(capture: Capture) -> tuple[NormalEstimate, float, float]:
+def claim(capture):
     """Return the estimate, and the claimed and the true share within 5 degrees."""
     estimate = estimate_normals(capture, make_estimator("spline-net"))
     return estimate, estimate.expected_under_5, estimate.errors.under_5

@@ -3,29 +3,29 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from numpy.typing import NDArray
 
-from scenes import Floats
+from scenes import FOUR_LIGHTS
 from splinecli.capture import Capture
 from splinecli.estimate.inference import estimate_normals, estimate_pixels
 from splinecli.estimate.methods.estimator import TILE_PIXELS, LeastSquares
 from splinecli.lights.lighting import PixelLighting
+from splinecli.maths.normals import unit
 
-LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.48, -0.36, 0.8]])
 
-
-def bowl(height: int = 13, width: int = 11) -> tuple[Floats, NDArray[np.bool_]]:
+def bowl(height=13, width=11):
     """Normals (H, W, 3) that all lights reach, and a mask with holes."""
     y, x = np.mgrid[1 : -1 : height * 1j, -1 : 1 : width * 1j]
     normals = np.stack((0.2 * x, 0.2 * y, np.ones_like(x)), axis=-1)
     mask = x**2 + y**2 < 1
     mask[height // 2, width // 2] = False
-    return normals / np.linalg.norm(normals, axis=-1, keepdims=True), mask
+    return unit(normals), mask
 
 
-def capture(ground_truth: Floats | None = None) -> Capture:
+def capture(ground_truth=None):
     normals, mask = bowl()
-    return Capture("bowl", 0.7 * normals[mask] @ LIGHTS.T, LIGHTS, (0, 1, 2, 3), mask, ground_truth)
+    return Capture(
+        "bowl", 0.7 * normals[mask] @ FOUR_LIGHTS.T, FOUR_LIGHTS, (0, 1, 2, 3), mask, ground_truth
+    )
 
 
 def test_normals_stand_where_their_pixels_are():
@@ -42,7 +42,7 @@ def test_normals_stand_where_their_pixels_are():
 @pytest.mark.parametrize("tile_pixels", [1, 7, 10_000])
 def test_tiles_change_nothing_but_the_progress(tile_pixels):
     whole = estimate_normals(capture(), LeastSquares())
-    done: list[int] = []
+    done = []
     estimator = LeastSquares()
     estimator.tile_pixels = tile_pixels
     tiled = estimate_normals(capture(), estimator, progress=done.append)
@@ -55,7 +55,7 @@ def test_tiles_change_nothing_but_the_progress(tile_pixels):
 
 
 @pytest.mark.parametrize(
-    ("near", "n_lights", "most"), [(False, 10, 1 << 19), (True, 10, 1 << 18), (True, 40, 1 << 16)]
+    "near, n_lights, most", [(False, 10, 1 << 19), (True, 10, 1 << 18), (True, 40, 1 << 16)]
 )
 def test_an_estimator_gets_fewer_pixels_at_once_if_each_has_many_numbers(near, n_lights, most):
     """Under near lamps, every pixel has its own directions, which would take gigabytes."""

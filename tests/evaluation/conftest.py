@@ -2,34 +2,39 @@
 squares is exact.
 """
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from scenes import shade, spiral_lights, write_capture
+from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 from splinecli.maths.normals import unit
 
 SIZE = 12  # pixels a side; the outermost ring is outside the mask
 
 
-def dome_normals() -> NDArray[np.float64]:
+def dome_normals():
     """(SIZE, SIZE, 3) up to 35 degrees from the view axis: less than 90 from every light."""
     y, x = 0.4 * np.mgrid[1 : -1 : SIZE * 1j, -1 : 1 : SIZE * 1j]
     return unit(np.stack([x, y, np.sqrt(1 - x**2 - y**2)], axis=2))
 
 
+def evaluation_of(maes_deg, n_lights=10, *, seconds=1.0, skipped=(), **protocol):
+    """An evaluation from {capture: {method: (MAE of each trial, ...)}}."""
+    results = tuple(
+        Result(method, capture, n_lights or 96, tuple(maes), seconds)
+        for capture, methods in maes_deg.items()
+        for method, maes in methods.items()
+    )
+    return Evaluation(Protocol(n_lights, len(results[0].maes_deg), **protocol), results, skipped)
+
+
 @pytest.fixture
-def write_dome(tmp_path: Path) -> Callable[..., Path]:
+def write_dome(tmp_path):
     """Write a capture folder below tmp_path: 16-bit images, mask, lights, and ground truth by
     default.
     """
 
-    def write(
-        name: str = "dome", *, n_lights: int = 8, ground_truth: bool = True, without_truth: int = 0
-    ) -> Path:
+    def write(name="dome", *, n_lights=8, ground_truth=True, without_truth=0):
         lights, normals = spiral_lights(n_lights, 40, 15), dome_normals()
         photographs = np.rint(0.9 * 65535 * np.moveaxis(shade(normals, lights), 2, 0)).astype(
             np.uint16

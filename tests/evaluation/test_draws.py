@@ -2,15 +2,12 @@
 each draw.
 """
 
-from collections.abc import Sequence
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scenes import evaluate, shade, sphere_cap, spiral_lights, write_capture
+from scenes import evaluate, put, shade, sphere_cap, spiral_lights, write_capture
 from splinecli.capture import open_capture
 from splinecli.errors import InputError, UsageError
 from splinecli.estimate.inference import estimate_normals
@@ -22,11 +19,11 @@ from splinecli.lights.draws import draw_lights
 from splinecli.maths.normals import unit
 from splinecli.recipe import prepare_capture
 from splinecli.recipe.steps import begin, follow
-from splinecli.recipe.work import RecipeOptions, Work
+from splinecli.recipe.work import RecipeOptions
 from splinecli.records.white_level import WhiteLevel
 
 
-def random_lights(n_lights: int, seed: int = 0) -> np.ndarray:
+def random_lights(n_lights, seed=0):
     lights = np.random.default_rng(seed).normal(size=(n_lights, 3))
     lights[:, 2] = np.abs(lights[:, 2]) + 0.2
     return unit(lights)
@@ -82,20 +79,16 @@ def test_lights_in_one_plane_are_drawn_again():
     assert draws[:10] == draw_lights(flat, 3, trials=10, seed=0)
 
 
-@pytest.mark.parametrize(("name", "value"), [("trials", 0), ("seed", -1)])
+@pytest.mark.parametrize("name, value", [("trials", 0), ("seed", -1)])
 def test_what_cannot_be_drawn(name, value):
     with pytest.raises(UsageError, match=f"--{name} is {value}; expected"):
         draw_lights(LIGHTS, n_lights=10, **{name: value})
 
 
-def write(tmp_path: Path, text: str) -> Path:
-    path = tmp_path / "draws.txt"
-    path.write_text(text)
-    return path
-
-
 def test_a_draws_file(tmp_path):
-    file = read_draws(write(tmp_path, "# ours\n0 3 5\n\n 95,1,  2  # in any order\n7\t8;9"))
+    file = read_draws(
+        put(tmp_path / "draws.txt", "# ours\n0 3 5\n\n 95,1,  2  # in any order\n7\t8;9")
+    )
     assert (file.draws, file.lines, file.n_lights) == (
         ((0, 3, 5), (95, 1, 2), (7, 8, 9)),
         (2, 4, 5),
@@ -105,7 +98,7 @@ def test_a_draws_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "problem"),
+    "text, problem",
     [
         ("0 1 2\n0 x 2", ':2: found "x", expected a light index from 0.'),
         ("0 1 2\n\n0 -1 2", ':3: found "-1", expected a light index from 0.'),
@@ -118,7 +111,7 @@ def test_a_draws_file(tmp_path):
     ],
 )
 def test_a_wrong_draws_file(tmp_path, text, problem):
-    path = write(tmp_path, text)
+    path = put(tmp_path / "draws.txt", text)
     with pytest.raises(InputError) as raised:
         read_draws(path)
     assert str(raised.value) == f"{path}{problem}"
@@ -129,7 +122,7 @@ LS = make_estimator("ls")
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     """A matte sphere under nine lights. The camera clips three images at 6000; the others are too
     dark for that.
     """
@@ -150,7 +143,7 @@ def folder(tmp_path: Path) -> Path:
     return write_capture(tmp_path / "half", images, lights, normals=normals, intensities=colours)
 
 
-def mae_deg(folder: Path, lights: tuple[int, ...], **settings: bool) -> float:
+def mae_deg(folder, lights, **settings):
     """The error of a capture under these lights, read without any other image."""
     return estimate_normals(
         prepare_capture(open_capture(folder), lights, RecipeOptions(**settings)), LS
@@ -178,7 +171,7 @@ def test_the_number_of_trials_does_not_change_a_trial(folder, max_pixels):
     assert few == pytest.approx(maes_deg(12, TrialStore()), abs=1e-6)
 
 
-def observed(folder: Path, lights: Sequence[int] | None = None) -> Work:
+def observed(folder, lights=None):
     return follow(begin(open_capture(folder), lights), last="observations")
 
 

@@ -1,11 +1,9 @@
 """Plots decode, have the size their panels need, and carry each method's colour."""
 
-from itertools import product
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from evaluation.conftest import evaluation_of
 from scenes import decode_rgb
 from splinecli.evaluation.figures import light_noise_curves, lights_curves
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
@@ -14,34 +12,23 @@ from splinecli.pictures.plots import method_styles
 METHODS = ("ls", "spline-net")
 
 
-def evaluation_of(
-    captures: list[str],
-    n_lights: int | None = 10,
-    light_noise_deg: float = 0.0,
-    *,
-    all_lights: int = 96,
-) -> Evaluation:
-    level = 20 / (n_lights or all_lights) + light_noise_deg
-    results = tuple(
-        Result(
-            method,
-            capture,
-            n_lights or all_lights,
-            (m + level, m + level + 0.5, m + level + 1),
-            1.0,
-        )
-        for capture, (m, method) in product(captures, enumerate(METHODS, start=3))
+def evaluated(captures, n_lights=10, light_noise_deg=0.0):
+    level = 20 / (n_lights or 96) + light_noise_deg
+    maes_deg = {
+        method: [m + level + more for more in (0, 0.5, 1)] for m, method in enumerate(METHODS, 3)
+    }
+    return evaluation_of(
+        dict.fromkeys(captures, maes_deg), n_lights, light_noise_deg=light_noise_deg
     )
-    return Evaluation(Protocol(n_lights, 3, light_noise_deg=light_noise_deg), results)
 
 
-def share_of(colour: str, picture: NDArray[np.uint8]) -> float:
+def share_of(colour, picture):
     rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
     return float((np.abs(picture.astype(int) - rgb).max(axis=2) <= 2).mean())
 
 
 @pytest.mark.parametrize(
-    ("captures", "across", "down"),
+    "captures, across, down",
     [
         (["ball"], 1, 1),
         (["ball", "cat"], 3, 1),
@@ -51,24 +38,24 @@ def share_of(colour: str, picture: NDArray[np.uint8]) -> float:
     ],
 )
 def test_a_panel_for_each_capture_and_the_average(captures, across, down):
-    picture = decode_rgb(lights_curves([evaluation_of(captures, k) for k in (4, 10, None)]))
+    picture = decode_rgb(lights_curves([evaluated(captures, k) for k in (4, 10, None)]))
     assert picture.shape == (540 * down + 80, 640 * across, 3) and (picture[0] == 255).all()
 
 
 def test_each_method_has_its_colour_in_both_plots():
     styles = method_styles(METHODS)
     for png in (
-        lights_curves([evaluation_of(["ball"], k) for k in (4, 10, 32)]),
-        light_noise_curves([evaluation_of(["ball"], 10, noise) for noise in (0, 2, 4)]),
+        lights_curves([evaluated(["ball"], k) for k in (4, 10, 32)]),
+        light_noise_curves([evaluated(["ball"], 10, noise) for noise in (0, 2, 4)]),
     ):
         for method in METHODS:
             assert share_of(styles[method].colour, decode_rgb(png)) > 0.002  # a line 3 pixels thick
 
 
 def test_captures_that_not_all_have_are_left_out():
-    fewer = evaluation_of(["ball"], 50)
-    both = evaluation_of(["ball", "cat"], 10)
-    assert lights_curves([both, fewer]) == lights_curves([evaluation_of(["ball"], 10), fewer])
+    fewer = evaluated(["ball"], 50)
+    both = evaluated(["ball", "cat"], 10)
+    assert lights_curves([both, fewer]) == lights_curves([evaluated(["ball"], 10), fewer])
 
 
 def test_odd_names_one_point_and_one_trial_are_drawn():

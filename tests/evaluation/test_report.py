@@ -3,46 +3,42 @@
 import base64
 import re
 from dataclasses import replace
-from itertools import pairwise, product
+from itertools import pairwise
 
 import cv2
 import numpy as np
 import pytest
 
+from evaluation.conftest import evaluation_of
 from html_page import HtmlPage
 from splinecli import __version__
 from splinecli.evaluation.document import html_report
-from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 from splinecli.records.documents import SkippedCapture
 
 PNG = cv2.imencode(".png", np.zeros((30, 40, 3), np.uint8))[1].tobytes()
 WIDE_PNG = cv2.imencode(".png", np.zeros((30, 400, 3), np.uint8))[1].tobytes()
 
 
-def all_of(page: HtmlPage, tag: str) -> list[dict[str, str | None]]:
+def all_of(page, tag):
     return [attributes for name, attributes in page.tags if name == tag]
 
 
-def evaluation_of(
-    methods: list[str], captures: list[str], *, trials: int = 4, n_lights: int | None = 10
-) -> Evaluation:
+def evaluated(methods, captures, *, trials=4, n_lights=10):
     generator = np.random.default_rng(3)
-    results = tuple(
-        Result(
-            method, capture, n_lights or 96, tuple(5 + m + generator.normal(0, 0.1, trials)), 0.25
-        )
-        for capture, (m, method) in product(captures, enumerate(methods))
-    )
-    protocol = Protocol(n_lights, trials, seed=7, max_pixels=500)
-    return Evaluation(
-        protocol, results, (SkippedCapture(capture="bear", reason="bear: no images."),)
-    )
+    maes_deg = {
+        capture: {
+            method: 5 + m + generator.normal(0, 0.1, trials) for m, method in enumerate(methods)
+        }
+        for capture in captures
+    }
+    skipped = (SkippedCapture(capture="bear", reason="bear: no images."),)
+    return evaluation_of(maes_deg, n_lights, seconds=0.25, skipped=skipped, seed=7, max_pixels=500)
 
 
 def test_one_evaluation():
     page = HtmlPage(
         html_report(
-            [evaluation_of(["ls", "iw12"], ["ball", "cat"])], [("A plot", PNG)], ["Ball is round."]
+            [evaluated(["ls", "iw12"], ["ball", "cat"])], [("A plot", PNG)], ["Ball is round."]
         )
     )
     assert page.text["h1"] == ["Photometric stereo: 2 methods on 2 captures"]
@@ -72,8 +68,8 @@ def test_one_evaluation():
 
 
 def test_several_evaluations_begin_with_their_averages():
-    evaluations = [evaluation_of(["ls", "iw12"], ["ball"], n_lights=k) for k in (4, 10)]
-    evaluations.append(evaluation_of(["ls", "iw12"], ["ball"], trials=1, n_lights=None))
+    evaluations = [evaluated(["ls", "iw12"], ["ball"], n_lights=k) for k in (4, 10)]
+    evaluations.append(evaluated(["ls", "iw12"], ["ball"], trials=1, n_lights=None))
     page = HtmlPage(html_report(evaluations, [], []))
     headings = page.text["h2"]
     assert headings[-4:] == [
@@ -89,7 +85,7 @@ def test_several_evaluations_begin_with_their_averages():
 
 def test_many_methods_have_a_matrix():
     methods = [f"m{i}" for i in range(5)]
-    page = HtmlPage(html_report([evaluation_of(methods, ["ball"])], [], []))
+    page = HtmlPage(html_report([evaluated(methods, ["ball"])], [], []))
     assert any(words.startswith("Average MAE of the row’s method") for words in page.text["span"])
     assert not any("is better than" in words for words in page.text["li"])
     # Every pair twice in the matrix, and on one capture and the average in the list.
@@ -97,7 +93,7 @@ def test_many_methods_have_a_matrix():
 
 
 def test_it_stands_alone():
-    html = html_report([evaluation_of(["ls", "iw12"], ["ball"])], [("A", PNG), ("B", WIDE_PNG)], [])
+    html = html_report([evaluated(["ls", "iw12"], ["ball"])], [("A", PNG), ("B", WIDE_PNG)], [])
     page = HtmlPage(html)
     assert not all_of(page, "script") + all_of(page, "link")
     assert not re.search(r"""(src|href)\s*=\s*["'](?!data:)|url\(|@import|https?:""", html)
@@ -112,7 +108,7 @@ def test_it_stands_alone():
 @pytest.mark.parametrize("name", ["<b>&", '"><script>alert(1)</script>', "{{ 7 * 7 }}", "a'b"])
 def test_names_are_text(name):
     evaluation = replace(
-        evaluation_of([name, "ls"], [name + "1", "ball"]),
+        evaluated([name, "ls"], [name + "1", "ball"]),
         skipped=(SkippedCapture(capture=name, reason=name),),
     )
     page = HtmlPage(html_report([evaluation], [(name, PNG)], [name]))
@@ -122,7 +118,7 @@ def test_names_are_text(name):
 
 
 def test_it_can_be_read_by_all():
-    html = html_report([evaluation_of(["ls", "iw12"], ["ball"])], [("A", PNG)], [])
+    html = html_report([evaluated(["ls", "iw12"], ["ball"])], [("A", PNG)], [])
     page = HtmlPage(html)
     assert all_of(page, "html") == [{"lang": "en"}]
     assert {"name": "viewport", "content": "width=device-width, initial-scale=1"} in all_of(

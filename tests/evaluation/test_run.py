@@ -3,16 +3,14 @@ DiLiGenT.
 """
 
 import os
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.testing import assert_array_equal
 
-from scenes import evaluate
+from scenes import evaluate, read_image, write_image
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.estimate.methods import Estimator, make_estimator
 from splinecli.evaluation.protocol import Protocol
@@ -21,7 +19,7 @@ from splinecli.evaluation.trials import TrialStore
 from splinecli.maths.normals import unit
 from splinecli.recipe import read_capture
 
-WriteDome = Callable[..., Path]
+LS = [make_estimator("ls")]
 
 
 class Fake(Estimator):
@@ -29,18 +27,14 @@ class Fake(Estimator):
 
     fingerprint = "fake"
 
-    def __init__(
-        self, folder: Path, angles_deg: Sequence[float] = (0,), name: str = "fake"
-    ) -> None:
+    def __init__(self, folder, angles_deg=(0,), name="fake"):
         self.name, self.lights, self.observations = name, list[Any](), list[Any]()
         capture = read_capture(folder)
         truth = capture.ground_truth[capture.mask]
         self._truth = truth[truth.any(axis=1)].astype(np.float64)
         self._angles = np.radians(angles_deg)
 
-    def estimate(
-        self, observations: Any, lights: Any, *, progress: object = None
-    ) -> NDArray[np.float64]:
+    def estimate(self, observations, lights, *, progress=None):
         angle = self._angles[len(self.lights) % len(self._angles)]
         self.lights.append(lights)
         self.observations.append(observations)
@@ -53,17 +47,15 @@ class Fake(Estimator):
 class Constant(Fake):
     """Gives one vector for every pixel, whatever it sees."""
 
-    def __init__(self, vector: Sequence[float]) -> None:
+    def __init__(self, vector):
         self.name, self._vector, self.lights = "constant", vector, []
 
-    def estimate(
-        self, observations: Any, lights: Any, *, progress: object = None
-    ) -> NDArray[np.float64]:
+    def estimate(self, observations, lights, *, progress=None):
         self.lights.append(lights)
         return np.tile(self._vector, (len(observations), 1))
 
 
-def test_mean_and_deviation_over_trials(write_dome: WriteDome) -> None:
+def test_mean_and_deviation_over_trials(write_dome):
     folder = write_dome()
     fake = Fake(folder, angles_deg=(1, 3, 5))
     (result,) = evaluate([folder], [fake], Protocol(n_lights=5, trials=3)).results
@@ -72,34 +64,34 @@ def test_mean_and_deviation_over_trials(write_dome: WriteDome) -> None:
     assert result.std_deg == pytest.approx(np.sqrt((4 + 0 + 4) / 3), abs=1e-4)
 
 
-def test_all_methods_and_captures_see_the_same_draws(write_dome: WriteDome) -> None:
+def test_all_methods_and_captures_see_the_same_draws(write_dome):
     folders = [write_dome("a"), write_dome("b")]
     first, second = Fake(folders[0], name="first"), Fake(folders[0], name="second")
     protocol = Protocol(n_lights=4, trials=3, seed=5, light_noise_deg=3)
     evaluate(folders, [first, second], protocol)
-    np.testing.assert_array_equal(first.lights, second.lights)
-    np.testing.assert_array_equal(first.lights[:3], first.lights[3:])
+    assert_array_equal(first.lights, second.lights)
+    assert_array_equal(first.lights[:3], first.lights[3:])
     backwards = Fake(folders[0])
     evaluate(folders[::-1], [backwards], protocol)
-    np.testing.assert_array_equal(first.lights, backwards.lights)
+    assert_array_equal(first.lights, backwards.lights)
 
 
-def test_a_draws_file_goes_before_random_draws(write_dome: WriteDome, tmp_path: Path) -> None:
+def test_a_draws_file_goes_before_random_draws(write_dome, tmp_path):
     folder = write_dome()
     (tmp_path / "draws.txt").write_text("5 0 1\n2 3 7\n")
     fake, whole = Fake(folder), read_capture(folder)
     evaluation = evaluate([folder], [fake], Protocol(trials=99, draws_file=tmp_path / "draws.txt"))
     assert (evaluation.protocol.n_lights, evaluation.protocol.trials) == (3, 2)
     assert (evaluation.results[0].n_lights, evaluation.results[0].trials) == (3, 2)
-    np.testing.assert_array_equal(fake.observations[0], whole.observations[:, [5, 0, 1]])
-    np.testing.assert_array_equal(fake.lights[1], whole.light_directions[[2, 3, 7]])
+    assert_array_equal(fake.observations[0], whole.observations[:, [5, 0, 1]])
+    assert_array_equal(fake.lights[1], whole.light_directions[[2, 3, 7]])
 
 
-def test_a_draws_file_that_does_not_fit_a_capture(write_dome: WriteDome, tmp_path: Path) -> None:
+def test_a_draws_file_that_does_not_fit_a_capture(write_dome, tmp_path):
     (tmp_path / "draws.txt").write_text("0 1 2\n0 1 9\n")
     folders = [write_dome("eight"), write_dome("ten", n_lights=10)]
     protocol = Protocol(draws_file=tmp_path / "draws.txt")
-    evaluation = evaluate(folders, [make_estimator("ls")], protocol)
+    evaluation = evaluate(folders, LS, protocol)
     assert evaluation.captures == ("ten",)
     problem = (
         f"{tmp_path}/draws.txt:2: found light index 9, expected 0 to 7: the capture has 8 lights."
@@ -107,12 +99,10 @@ def test_a_draws_file_that_does_not_fit_a_capture(write_dome: WriteDome, tmp_pat
     assert [(s.capture, s.reason) for s in evaluation.skipped] == [("eight", problem)]
 
 
-def test_light_noise_costs_least_squares_its_exactness(write_dome: WriteDome) -> None:
+def test_light_noise_costs_least_squares_its_exactness(write_dome):
     folder = write_dome()
     errors = [
-        evaluate(
-            [folder], [make_estimator("ls")], Protocol(trials=20, light_noise_deg=sigma)
-        ).results[0]
+        evaluate([folder], LS, Protocol(trials=20, light_noise_deg=sigma)).results[0]
         for sigma in (0, 1, 4)
     ]
     # all lights, other noise in each trial
@@ -123,7 +113,7 @@ def test_light_noise_costs_least_squares_its_exactness(write_dome: WriteDome) ->
     assert errors[2].mae_deg == pytest.approx(4 * errors[1].mae_deg, rel=0.1)
 
 
-def test_captures_that_cannot_be_scored_are_skipped(write_dome: WriteDome, tmp_path: Path) -> None:
+def test_captures_that_cannot_be_scored_are_skipped(write_dome, tmp_path):
     good, untrue, few = (
         write_dome("good"),
         write_dome("untrue", ground_truth=False),
@@ -132,7 +122,7 @@ def test_captures_that_cannot_be_scored_are_skipped(write_dome: WriteDome, tmp_p
     broken = write_dome("broken")
     (broken / "003.png").write_bytes(b"no image")
     folders = [untrue, good, broken, few, tmp_path / "missing"]
-    evaluation = evaluate(folders, [make_estimator("ls")], Protocol(n_lights=5, trials=10))
+    evaluation = evaluate(folders, LS, Protocol(n_lights=5, trials=10))
     assert evaluation.captures == ("good",)
     assert [skipped.capture for skipped in evaluation.skipped] == [
         "untrue",
@@ -150,8 +140,7 @@ def test_captures_that_cannot_be_scored_are_skipped(write_dome: WriteDome, tmp_p
     assert str(tmp_path / "missing") in reasons[3]
 
 
-def test_nothing_scored_is_an_error(write_dome: WriteDome, tmp_path: Path) -> None:
-    ls = make_estimator("ls")
+def test_nothing_scored_is_an_error(write_dome, tmp_path):
     untrue, few = write_dome("untrue", ground_truth=False), write_dome("few", n_lights=4)
     none = (
         "none of the 2 captures could be scored; the first: .*untrue: the capture has no ground"
@@ -163,37 +152,29 @@ def test_nothing_scored_is_an_error(write_dome: WriteDome, tmp_path: Path) -> No
         ([few], UsageError, "the capture has 4 lights, too few for draws of 5"),
     ):
         with pytest.raises(error, match=message):
-            evaluate(folders, [ls], Protocol(n_lights=5))
+            evaluate(folders, LS, Protocol(n_lights=5))
 
 
-def test_names_tell_captures_apart(write_dome: WriteDome, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_tell_captures_apart(write_dome, monkeypatch):
     folders = [write_dome("few/dome", n_lights=4), write_dome("many/dome"), write_dome("many/bowl")]
-    ls = [make_estimator("ls")]
-    assert evaluate(folders, ls, Protocol()).captures == ("few/dome", "many/dome", "many/bowl")
+    assert evaluate(folders, LS, Protocol()).captures == ("few/dome", "many/dome", "many/bowl")
     monkeypatch.chdir(folders[1])
-    assert evaluate([Path(), folders[1], folders[2]], ls, Protocol()).captures == ("dome", "bowl")
+    assert evaluate([Path(), folders[1], folders[2]], LS, Protocol()).captures == ("dome", "bowl")
 
 
 @pytest.mark.parametrize("vector", [(0, 0, 0), (0, 0, np.nan), (0, 0, 0.5)])
-def test_normals_that_are_none_are_not_scored(
-    write_dome: WriteDome, vector: Sequence[float]
-) -> None:
+def test_normals_that_are_none_are_not_scored(write_dome, vector):
     with pytest.raises(
         SplinecliError, match="method constant gave normals that are not unit vectors"
     ):
         evaluate([write_dome()], [Constant(vector)], Protocol())
 
 
-def test_progress(write_dome: WriteDome) -> None:
+def test_progress(write_dome):
     folders = [write_dome("a"), write_dome("b")]
-    seen: list[tuple[float, str]] = []
+    seen = []
     protocols = [Protocol(n_lights=7, trials=2), Protocol()]
-    evaluate_all(
-        folders,
-        [make_estimator("ls")],
-        protocols,
-        on_progress=lambda share, note: seen.append((share, note)),
-    )
+    evaluate_all(folders, LS, protocols, on_progress=lambda share, note: seen.append((share, note)))
     shares, notes = zip(*seen, strict=True)
     assert min(shares) == 0
     assert sum(shares) == pytest.approx(1)
@@ -203,7 +184,7 @@ def test_progress(write_dome: WriteDome) -> None:
     assert notes[-1] == "trial 6 of 6"
 
 
-def test_trials_at_a_time_change_nothing(write_dome: WriteDome) -> None:
+def test_trials_at_a_time_change_nothing(write_dome):
     folders = [write_dome("a"), write_dome("b", n_lights=9)]
     estimators = [make_estimator("ls"), make_estimator("iw12")]
     protocols = [Protocol(4, trials=5, light_noise_deg=noise) for noise in (0, 3)]
@@ -218,27 +199,24 @@ def test_trials_at_a_time_change_nothing(write_dome: WriteDome) -> None:
         )
 
 
-def test_one_that_was_cut_off_goes_on(write_dome: WriteDome, tmp_path: Path) -> None:
+def test_one_that_was_cut_off_goes_on(write_dome, tmp_path):
     folder, path = write_dome(), tmp_path / "trials.jsonl"
-    first = Fake(folder, angles_deg=(1, 2))
-    evaluate_all([folder], [first], [Protocol(4, trials=2)], store=TrialStore(path))
+
+    def scored(angles_deg, trials, **options):
+        fake, store = Fake(folder, angles_deg), TrialStore(path, **options)
+        return evaluate_all([folder], [fake], [Protocol(4, trials=trials)], store=store)[0], fake
+
+    scored((1, 2), 2)
     lines = path.read_text().splitlines(keepends=True)
     # Killed while it wrote the second line.
     path.write_text(lines[0] + lines[1][: len(lines[1]) // 2])
-    again = Fake(folder, angles_deg=(5, 6, 7))
-    evaluation = evaluate_all([folder], [again], [Protocol(4, trials=4)], store=TrialStore(path))[0]
+    evaluation, again = scored((5, 6, 7), 4)
     assert evaluation.results[0].maes_deg == pytest.approx((1, 5, 6, 7), abs=1e-4)
     assert len(again.lights) == 3
     # Nothing is left to do, and nothing of the first run's was lost.
-    idle = Fake(folder, angles_deg=(90,))
-    assert (
-        evaluate_all([folder], [idle], [Protocol(4, trials=4)], store=TrialStore(path))[0]
-        == evaluation
-    )
-    assert idle.lights == []
-    fresh = evaluate_all(
-        [folder], [idle], [Protocol(4, trials=4)], store=TrialStore(path, fresh=True)
-    )[0]
+    same, idle = scored((90,), 4)
+    assert (same, idle.lights) == (evaluation, [])
+    fresh, _ = scored((90,), 4, fresh=True)
     assert fresh.results[0].mae_deg == pytest.approx(90, abs=1e-4)
     assert len(path.read_text().splitlines()) == 4
 
@@ -256,16 +234,14 @@ def test_one_that_was_cut_off_goes_on(write_dome: WriteDome, tmp_path: Path) -> 
         "as_stored",
     ],
 )
-def test_a_trial_of_something_else_does_not_count(
-    write_dome: WriteDome, tmp_path: Path, change: str
-) -> None:
+def test_a_trial_of_something_else_does_not_count(write_dome, tmp_path, change):
     folder, path = write_dome(), tmp_path / "trials.jsonl"
-    settings: dict[str, Any] = {"n_lights": 4, "max_pixels": 50, "light_noise_deg": 1.0}
-    evaluate_all([folder], [Constant((0, 0, 1))], [Protocol(**settings)], store=TrialStore(path))
+    settings = {"n_lights": 4, "max_pixels": 50, "light_noise_deg": 1.0}
     fake = Constant((0, 0, 1))
+    evaluate_all([folder], [fake], [Protocol(**settings)], store=TrialStore(path))
+    fake.lights.clear()
     if change == "photograph":
-        image = cv2.imread(str(folder / "003.png"), cv2.IMREAD_UNCHANGED)
-        assert cv2.imwrite(str(folder / "003.png"), image[::-1].copy())
+        write_image(folder / "003.png", read_image(folder / "003.png")[::-1].copy())
     elif change == "lights":
         lights = folder / "light_directions.txt"
         lights.write_text(lights.read_text() + "\n")
@@ -277,7 +253,7 @@ def test_a_trial_of_something_else_does_not_count(
     assert fake.lights
 
 
-def test_captures_with_equal_stamps_are_not_taken_for_each_other(write_dome: WriteDome) -> None:
+def test_captures_with_equal_stamps_are_not_taken_for_each_other(write_dome):
     """As out of an archive whose times were normalised: names, sizes and times of all files are the
     same.
     """
@@ -293,31 +269,29 @@ def test_captures_with_equal_stamps_are_not_taken_for_each_other(write_dome: Wri
         sorted((path.name, path.stat().st_size) for path in folder.iterdir()) for folder in folders
     ]
     assert sizes[0] == sizes[1]
-    first, second = evaluate(folders, [make_estimator("ls")], Protocol()).results
+    first, second = evaluate(folders, LS, Protocol()).results
     assert first.mae_deg < 0.1 < second.mae_deg
 
 
 def test_noise_that_lays_lights_into_a_plane_is_drawn_again(write_dome, monkeypatch):
-    sigmas: list[float] = []
+    sigmas = []
 
-    def tilt(lights: NDArray[np.float64], sigma_deg: float, *_: object) -> NDArray[np.float64]:
+    def tilt(lights, sigma_deg, *_):
         sigmas.append(sigma_deg)
         return unit(lights * (1, 0, 1)) if len(sigmas) == 1 else lights
 
     monkeypatch.setattr("splinecli.evaluation.trials.tilt_lights", tilt)
     protocol = Protocol(3, trials=1, light_noise_deg=30.0)
-    assert evaluate([write_dome()], [make_estimator("ls")], protocol).results[0].mae_deg < 0.02
+    assert evaluate([write_dome()], LS, protocol).results[0].mae_deg < 0.02
     assert sigmas == [30, 30]
 
 
-def test_first_images_are_left_out(write_dome: WriteDome) -> None:
+def test_first_images_are_left_out(write_dome):
     folders = [write_dome("bearPNG"), write_dome("other")]
     fake = Fake(folders[0])
     evaluation = evaluate(folders, [fake], Protocol(skip_first={"bearPNG": 3}))
     assert [len(lights) for lights in fake.lights] == [5, 8]
-    np.testing.assert_array_equal(
-        fake.observations[0], read_capture(folders[0]).observations[:, 3:]
-    )
+    assert_array_equal(fake.observations[0], read_capture(folders[0]).observations[:, 3:])
     assert [result.n_lights for result in evaluation.results] == [5, 8]
     assert evaluation.notes == ("bearPNG: the first 3 images were left out.",)
     every = Fake(folders[0])
@@ -325,9 +299,7 @@ def test_first_images_are_left_out(write_dome: WriteDome) -> None:
     assert [len(lights) for lights in every.lights] == [4, 7]
 
 
-def test_draws_keep_to_the_images_that_are_not_left_out(
-    write_dome: WriteDome, tmp_path: Path
-) -> None:
+def test_draws_keep_to_the_images_that_are_not_left_out(write_dome, tmp_path):
     folder = write_dome(n_lights=9)
     fake = Fake(folder)
     evaluate([folder], [fake], Protocol(4, trials=20, skip_first={"*": 3}))

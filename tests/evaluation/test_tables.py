@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from evaluation.conftest import evaluation_of
 from splinecli.evaluation.document import html_report, results_csv, results_document
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 from splinecli.evaluation.tables import (
@@ -75,7 +76,7 @@ def test_rows_for_a_terminal():
 
 
 @pytest.mark.parametrize(
-    ("name", "shown"),
+    "name, shown",
     [
         ("a|b", r"a\|b"),
         ("![a](javascript:alert(1)) &lt; ~~b~~", r"!\[a\](javascript:alert(1)) \&lt; \~\~b\~\~"),
@@ -131,20 +132,13 @@ def test_latex_escapes_names():
     assert unescaped.count("{") == unescaped.count("}")
 
 
-def evaluation_of(**maes_deg: dict[str, tuple[float, ...]]) -> Evaluation:
-    """From {capture: {method: MAE of each trial}}."""
-    pairs = ((capture, *item) for capture, methods in maes_deg.items() for item in methods.items())
-    results = tuple(Result(method, capture, 10, maes, 1.0) for capture, method, maes in pairs)
-    return Evaluation(Protocol(n_lights=10, trials=10), results)
-
-
 # Student's own example (Biometrika 1908): hours of sleep that two drugs gained ten patients.
 FIRST = (0.7, -1.6, -0.2, -1.2, -0.1, 3.4, 3.7, 0.8, 0.0, 2.0)
 SECOND = (1.9, 0.8, 1.1, 0.1, -0.1, 4.4, 5.5, 1.6, 4.6, 3.4)
 
 
 def test_students_example():
-    comparison, average = compare(evaluation_of(ball={"ls": FIRST, "iw12": SECOND}))
+    comparison, average = compare(evaluation_of({"ball": {"ls": FIRST, "iw12": SECOND}}))
     # As R's t.test(extra ~ group, paired = TRUE) prints it.
     assert comparison.p_value == pytest.approx(0.002833, abs=5e-7)
     assert comparison.interval_deg == pytest.approx((-2.4598858, -0.7001142), abs=5e-8)
@@ -174,7 +168,7 @@ def test_every_pair_on_every_capture_and_on_their_average():
         }
         for capture in ("ball", "cat", "cow")
     }
-    comparisons = compare(evaluation_of(**draws))
+    comparisons = compare(evaluation_of(draws))
     assert [(c.capture, c.first, c.second) for c in comparisons] == [
         (capture, *pair)
         for capture in ("ball", "cat", "cow", AVERAGE)
@@ -194,7 +188,7 @@ def test_every_pair_on_every_capture_and_on_their_average():
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "interval", "p_value", "differs"),
+    "first, second, interval, p_value, differs",
     [
         ((4.0,), (5.0,), None, None, None),  # one trial
         ((4.0, 5.0, 6.0), (4.5, 5.5, 6.5), None, None, None),  # no spread
@@ -203,7 +197,7 @@ def test_every_pair_on_every_capture_and_on_their_average():
     ],
 )
 def test_where_there_is_nothing_to_test(first, second, interval, p_value, differs):
-    for comparison in compare(evaluation_of(ball={"a": first, "b": second})):
+    for comparison in compare(evaluation_of({"ball": {"a": first, "b": second}})):
         assert comparison.interval_deg == interval
         assert comparison.p_value == comparison.p_holm == p_value
         assert comparison.differs is differs
@@ -212,7 +206,7 @@ def test_where_there_is_nothing_to_test(first, second, interval, p_value, differ
 
 def test_pairs_without_a_test_do_not_count_in_the_correction():
     shifted = tuple(value + 1 for value in FIRST)
-    comparisons = compare(evaluation_of(ball={"a": FIRST, "b": SECOND, "c": shifted}))
+    comparisons = compare(evaluation_of({"ball": {"a": FIRST, "b": SECOND, "c": shifted}}))
     on_ball = {(c.first, c.second): c for c in comparisons if c.capture == "ball"}
     assert on_ball["a", "c"].p_holm is None
     tested = [on_ball["a", "b"], on_ball["b", "c"]]
@@ -222,5 +216,5 @@ def test_pairs_without_a_test_do_not_count_in_the_correction():
 
 
 def test_the_average_takes_the_trials_all_captures_have():
-    uneven = evaluation_of(ball={"a": (1.0, 2.0, 9.0)}, cat={"a": (3.0, 5.0)})
+    uneven = evaluation_of({"ball": {"a": (1.0, 2.0, 9.0)}, "cat": {"a": (3.0, 5.0)}})
     assert trial_averages(uneven, "a") == (2.0, 3.5)

@@ -4,6 +4,7 @@ stated size.
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from splinecli.capture import Capture
 from splinecli.evaluation.trials import scored_rows, tilt_lights
@@ -14,7 +15,7 @@ MASK = np.random.default_rng(5).random((9, 7)) < 0.7
 
 
 @pytest.fixture
-def capture() -> Capture:
+def capture():
     """Observation 0 of a pixel is its flat index in the image; columns 3 and 4 have no ground
     truth.
     """
@@ -25,28 +26,28 @@ def capture() -> Capture:
     return Capture("c", np.stack([index] * 3, axis=1), LIGHTS, (4, 7, 9), MASK, truth)
 
 
-def test_pixels_without_ground_truth_go(capture: Capture) -> None:
+def test_pixels_without_ground_truth_go(capture):
     wanted = MASK.copy()
     wanted[:, 3:5] = False
     rows = scored_rows(capture)
-    np.testing.assert_array_equal(capture.observations[rows, 0], np.flatnonzero(wanted))
+    assert_array_equal(capture.observations[rows, 0], np.flatnonzero(wanted))
     kept = capture.choose_pixels(rows)
-    np.testing.assert_array_equal(kept.mask, wanted)
-    np.testing.assert_array_equal(kept.observations[:, 0], np.flatnonzero(wanted))
+    assert_array_equal(kept.mask, wanted)
+    assert_array_equal(kept.observations[:, 0], np.flatnonzero(wanted))
     assert kept.light_indices == (4, 7, 9)
 
 
-def test_a_part_of_the_pixels(capture: Capture) -> None:
+def test_a_part_of_the_pixels(capture):
     parts = [scored_rows(capture, max_pixels=10, seed=seed) for seed in (0, 0, 1)]
     for part in parts:
         assert len(part) == 10
         assert (np.diff(part) > 0).all()
         assert set(part) <= set(scored_rows(capture))
-    np.testing.assert_array_equal(parts[0], parts[1])
+    assert_array_equal(parts[0], parts[1])
     assert (parts[0] != parts[2]).any()
 
 
-def test_angles_have_the_wanted_root_mean_square() -> None:
+def test_angles_have_the_wanted_root_mean_square():
     lights = np.tile(unit(np.array([[0.3, -0.4, 1.0]])), (20_000, 1))
     tilted = tilt_lights(lights, 4.0, np.random.default_rng(0))
     angles = angle_between_deg(tilted, lights)
@@ -57,7 +58,7 @@ def test_angles_have_the_wanted_root_mean_square() -> None:
     np.testing.assert_allclose(np.linalg.norm(tilted, axis=1), 1)
 
 
-def test_lights_stay_above_the_horizon() -> None:
+def test_lights_stay_above_the_horizon():
     azimuth = np.linspace(0, 2 * np.pi, 5000)
     lights = unit(np.stack([np.cos(azimuth), np.sin(azimuth), np.full(5000, 0.001)], axis=1))
     assert (tilt_lights(lights, 30.0, np.random.default_rng(0))[:, 2] > 0).all()

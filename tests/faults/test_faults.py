@@ -13,6 +13,7 @@ import pytest
 
 from kills import content
 from scenes import write_capture, write_image
+from splinecli.cli.main import main
 from splinecli.errors import InputError
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.maths.normals import unit
@@ -28,19 +29,20 @@ COMMAND = f"{sys.executable} -m splinecli"
 LIGHTS = unit(np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1)], float))
 
 
-def shell(script: str, folder: Path) -> subprocess.CompletedProcess[str]:
+def shell(script, folder):
     return subprocess.run(
         ["bash", "-c", script], cwd=folder, capture_output=True, text=True, timeout=120
     )
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path, monkeypatch):
     """A folder with a flat capture of 60 x 60 pixels and the results of an earlier run in `out`."""
     noise = np.random.default_rng(0).integers(0, 2000, (len(LIGHTS), 60, 60))
     images = (50_000 * LIGHTS[:, 2, None, None] + noise).astype(np.uint16)
     write_capture(tmp_path / "a", images, LIGHTS, names="{}.png")
-    assert shell(f"{COMMAND} infer a --method ls -q", tmp_path).returncode == 0
+    monkeypatch.chdir(tmp_path)
+    assert main(["infer", "a", "--method", "ls", "-q"]) == 0
     return tmp_path
 
 
@@ -86,7 +88,7 @@ def test_a_full_disk_leaves_what_was_there(folder, disk_kb):
 
 
 @pytest.fixture(scope="module")
-def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def large(tmp_path_factory):
     """A capture of 1.2 megapixels, whose reading takes long enough to be interrupted."""
     folder = tmp_path_factory.mktemp("large")
     lights = np.tile(LIGHTS, (4, 1))

@@ -6,20 +6,18 @@ import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from numpy.typing import NDArray
 
 from scenes import shade, sphere_cap, spiral_lights
 from splinecli.capture.arrays import open_arrays
 from splinecli.images.lens_blur import NOISE, REACH, inverse_filter, remove_blur, surroundings
 from splinecli.recipe import RecipeOptions, prepare_capture
 
-Images = NDArray[np.float32]
 SIDE, FINER = 96, 4
 WHOLE = np.ones((SIDE, SIDE), np.bool_)
 NONE = np.zeros_like(WHOLE)
 
 
-def discs() -> Images:
+def discs():
     """Eight images (F, H, W) of bright discs in different places before gray, with the true
     coverage of each pixel.
     """
@@ -35,13 +33,13 @@ def discs() -> Images:
     return np.asarray(images.reshape(8, SIDE, FINER, SIDE, FINER).mean(axis=(2, 4)), np.float32)
 
 
-def blurred(images: Images, sigma: float) -> Images:
+def blurred(images, sigma):
     return np.stack(
         [cv2.GaussianBlur(image, (0, 0), sigma) if sigma else image for image in images]
     )
 
 
-def removed(images: Images) -> tuple[Images, float | None]:
+def removed(images):
     observations = np.ascontiguousarray(images.reshape(len(images), -1).T)
     sigma = remove_blur(observations, WHOLE, NONE)
     return observations.T.reshape(images.shape), sigma

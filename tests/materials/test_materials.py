@@ -12,7 +12,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from glb_file import read_glb
-from scenes import cap_directions, read_json, sphere, to_uint16, write_capture
+from scenes import cap_directions, codes, read_image, read_json, sphere, to_uint16, write_capture
 from splinecli import estimate_material
 from splinecli.capture import open_capture
 from splinecli.errors import InputError, UsageError
@@ -21,7 +21,7 @@ from splinecli.estimate.methods import make_estimator
 from splinecli.evaluation.figures import likeness
 from splinecli.lights.lighting import PixelLighting
 from splinecli.materials import maps
-from splinecli.materials.maps import MaterialMaps, render_gray
+from splinecli.materials.maps import render_gray
 from splinecli.materials.material_net import material_networks
 from splinecli.maths.normals import unit
 from splinecli.pipeline.evaluate import evaluate_captures
@@ -47,8 +47,7 @@ def ggx_sphere(lights, *, diffuse, f0, roughness):
     without Fresnel.
     """
     alpha = roughness**2
-    half = lights + np.array((0, 0, 1.0))
-    half = unit(half)
+    half = unit(lights + np.array((0, 0, 1.0)))
     n_l, n_h, n_v = (NORMALS @ lights.T).clip(0), (NORMALS @ half.T).clip(0), NORMALS[:, 2:]
     facets = alpha**2 / (np.pi * (n_h**2 * (alpha**2 - 1) + 1) ** 2)
 
@@ -59,7 +58,7 @@ def ggx_sphere(lights, *, diffuse, f0, roughness):
     return (n_l * (np.asarray(diffuse).reshape(-1, 1) + np.pi * f0 * specular)).astype(np.float32)
 
 
-def material(observations, lights=LIGHTS, colours=None) -> MaterialMaps:
+def material(observations, lights=LIGHTS, colours=None):
     return maps.estimate_material(
         MASK,
         NORMALS,
@@ -158,16 +157,16 @@ def test_generated_pixels_that_training_did_not_use():
 
 
 @pytest.mark.parametrize(
-    ("confidence", "codes"),
+    "confidence, expected",
     [(0.35, ["gray_material", "roughness_undetermined"]), (0.8, ["gray_material"])],
 )
-def test_roughness_that_the_images_do_not_determine(confidence, codes):
+def test_roughness_that_the_images_do_not_determine(confidence, expected):
     values = np.tile(
         np.array((0.4, 0.4, 0.4, 0.62, 0, 0.5, confidence), np.float32), (SIZE, SIZE, 1)
     )
     warnings = material_warnings(material_facts(values, MASK))
-    assert [warning.code for warning in warnings] == codes
-    if "roughness_undetermined" in codes:
+    assert codes(warnings) == expected
+    if "roughness_undetermined" in expected:
         assert "0.62 in the median" in warnings[-1].text
 
 
@@ -215,7 +214,7 @@ def test_channels_of_the_pictures():
 
 
 @pytest.fixture
-def glossy(tmp_path: Path) -> Path:
+def glossy(tmp_path):
     """A gray capture of a glossy sphere."""
     images = np.zeros((len(LIGHTS), SIZE, SIZE))
     images[:, MASK] = ggx_sphere(LIGHTS, diffuse=0.3, f0=0.05, roughness=0.4).T
@@ -225,32 +224,35 @@ def glossy(tmp_path: Path) -> Path:
     )
 
 
+def infer_material(folder, **options):
+    """The report of infer with the maps of the material, in the folder `out` beside the capture."""
+    given = {"method": "ls", "maps": ("material",), "output": str(folder.parent / "out")}
+    return infer_capture(folder, InferOptions(**given | options))
+
+
 def test_infer_writes_the_maps_and_a_gloss_for_the_mesh(glossy, tmp_path):
-    options = InferOptions(
-        method="ls", maps=("material",), surface=True, output=str(tmp_path / "out")
-    )
-    report = infer_capture(glossy, options)
+    report = infer_material(glossy, surface=True)
     folder = tmp_path / "out/ball"
     assert report["material"]["gray"]
-    assert "gray_material" in [warning["code"] for warning in report["warnings"]]
+    assert "gray_material" in codes(report)
     base = np.load(folder / "base_colour.npy")
     assert (base.dtype, base.shape) == (np.float32, (SIZE, SIZE, 3))
     assert (base[..., 0] == base[..., 2]).all()
-    tree, arrays = read_glb((folder / "mesh.glb").read_bytes())
-    [shown] = tree["materials"]
-    gloss = shown["pbrMetallicRoughness"]
-    assert {"baseColorTexture", "metallicRoughnessTexture"} <= set(gloss)
-    assert (gloss.get("metallicFactor", 1), gloss.get("roughnessFactor", 1)) == (1, 1)
-    stored = cv2.imread(str(folder / "metallic_roughness.png"))[..., ::-1]
-    assert_array_equal(arrays["gloss"][MASK], stored[MASK])
+    stored = read_image(folder / "metallic_roughness.png")[..., ::-1]
+    again = tmp_path / "again"
+    integrate_normal_map(IntegrateOptions(normals=folder, output=again))
+    for place in (folder, again):  # integrate keeps the material
+        tree, arrays = read_glb((place / "mesh.glb").read_bytes())
+        [shown] = tree["materials"]
+        gloss = shown["pbrMetallicRoughness"]
+        assert {"baseColorTexture", "metallicRoughnessTexture"} <= set(gloss)
+        assert (gloss.get("metallicFactor", 1), gloss.get("roughnessFactor", 1)) == (1, 1)
+        assert_array_equal(arrays["gloss"][MASK], stored[MASK])
 
 
-def test_coloured_lamps_do_not_tint_gray_images(glossy, tmp_path):
+def test_coloured_lamps_do_not_tint_gray_images(glossy):
     np.savetxt(glossy / "light_intensities.txt", np.tile((1.2, 1, 0.8), (len(LIGHTS), 1)))
-    report = infer_capture(
-        glossy, InferOptions(method="ls", maps=("material",), output=str(tmp_path / "out"))
-    )
-    assert "gray_material" in [warning["code"] for warning in report["warnings"]]
+    assert "gray_material" in codes(infer_material(glossy))
 
 
 def test_colours_of_another_shape_are_refused(glossy):
@@ -264,16 +266,9 @@ def test_colours_of_another_shape_are_refused(glossy):
         estimate_material(estimate, colours)
 
 
-def test_three_lights_are_refused(glossy, tmp_path):
-    options = InferOptions(
-        method="ls",
-        maps=("material",),
-        light_indices=(0, 1, 2),
-        output=str(tmp_path / "out"),
-        as_stored=True,
-    )
+def test_three_lights_are_refused(glossy):
     with pytest.raises(InputError, match="--maps material needs at least 4 lights, found 3"):
-        infer_capture(glossy, options)
+        infer_material(glossy, light_indices=(0, 1, 2), as_stored=True)
 
 
 def test_a_black_capture_has_some_material(tmp_path):
@@ -316,22 +311,23 @@ def test_colours_are_read_once_more(glossy):
     assert len(steps) == len(LIGHTS)
 
 
-def test_evaluate_compares_with_photographs_that_were_held_out(glossy, tmp_path):
+def relit(folder, n_lights):
+    """What evaluate finds of pictures under lights that were held out."""
     options = EvaluateOptions(
-        datasets=(glossy,),
+        datasets=(folder,),
         methods=("ls",),
-        n_lights=(8,),
+        n_lights=(n_lights,),
         trials=1,
         relight=True,
-        output=str(tmp_path / "scores"),
+        output=str(folder.parent / "scores"),
     )
-    [found] = evaluate_captures(options).document["relighting"]
-    assert (found["capture"], found["method"], len(found["lights"]), found["held_out"]) == (
-        "ball",
-        "ls",
-        8,
-        4,
-    )
+    return evaluate_captures(options)
+
+
+def test_evaluate_compares_with_photographs_that_were_held_out(glossy, tmp_path):
+    [found] = relit(glossy, 8).document["relighting"]
+    assert (found["capture"], found["method"]) == ("ball", "ls")
+    assert (len(found["lights"]), found["held_out"]) == (8, 4)
     assert found["material"]["psnr_db"] > found["lambertian"]["psnr_db"] + 1
     assert found["lambertian"]["psnr_db"] > found["nearest"]["psnr_db"]
     written = read_json(tmp_path / "scores/results.json")
@@ -339,16 +335,8 @@ def test_evaluate_compares_with_photographs_that_were_held_out(glossy, tmp_path)
     jsonschema.Draft202012Validator({**schema, "$ref": "#/$defs/Results"}).validate(written)
 
 
-def test_relighting_needs_lights_that_are_left(glossy, tmp_path):
-    options = EvaluateOptions(
-        datasets=(glossy,),
-        methods=("ls",),
-        n_lights=(None,),
-        relight=True,
-        output=str(tmp_path / "scores"),
-    )
-    outcome = evaluate_captures(options)
-    assert outcome.figure_problems == [
+def test_relighting_needs_lights_that_are_left(glossy):
+    assert relit(glossy, None).figure_problems == [
         "ball: the draw uses all lights, so none is held out. Use a smaller --n-lights."
     ]
 
@@ -367,13 +355,3 @@ def test_unequal_white_balance_changes_the_base_colour_alone(glossy):
     ratio = np.median(tinted.base_colour / white.base_colour, axis=0)
     # white highlights are assumed to be white
     assert_allclose(ratio / ratio[1], gains, atol=0.1)
-
-
-def test_integrate_keeps_the_material(glossy, tmp_path):
-    infer_capture(
-        glossy, InferOptions(method="ls", maps=("material",), output=str(tmp_path / "out"))
-    )
-    integrate_normal_map(IntegrateOptions(normals=tmp_path / "out/ball"))
-    _, arrays = read_glb((tmp_path / "out/ball/mesh.glb").read_bytes())
-    stored = cv2.imread(str(tmp_path / "out/ball/metallic_roughness.png"))[..., ::-1]
-    assert_array_equal(arrays["gloss"][MASK], stored[MASK])

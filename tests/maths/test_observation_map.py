@@ -8,7 +8,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
 from torch.testing import assert_close
 
 from distributions import seeded
@@ -25,7 +24,7 @@ SEEDS = st.integers(0, 2**31)
 quick = settings(max_examples=25, deadline=None)
 
 
-def random_rig(seed: int, pixels: int, lights: int) -> tuple[Tensor, Tensor]:
+def random_rig(seed, pixels, lights):
     """Observations (P, F) and shared directions (F, 3) in float64: no light falls on the border of
     a cell.
     """

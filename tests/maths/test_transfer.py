@@ -6,18 +6,15 @@ import io
 import struct
 import tracemalloc
 import zlib
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import tifffile
 from numpy.testing import assert_allclose
-from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
-from scenes import with_chunk
+from scenes import codes, with_chunk
 from splinecli.capture import open_capture
 from splinecli.capture.formats.facts import StatedCurve, read_header
 from splinecli.errors import UsageError
@@ -29,16 +26,16 @@ STORED = np.linspace(0, 1, 1001).astype(np.float32)
 PIXELS = (np.indices((9, 11)).sum(axis=0)[..., None] * (500, 700, 900) + 3000).astype(np.uint16)
 
 
-def curv(*numbers: int) -> bytes:
+def curv(*numbers):
     return b"curv" + bytes(4) + struct.pack(f">I{len(numbers)}H", len(numbers), *numbers)
 
 
-def para(kind: int, *numbers: float) -> bytes:
+def para(kind, *numbers):
     fixed = (round(65536 * number) for number in numbers)
     return b"para" + bytes(4) + struct.pack(f">HH{len(numbers)}i", kind, 0, *fixed)
 
 
-def profile(*curves: bytes, space: bytes = b"RGB ", name: str = "Made up") -> bytes:
+def profile(*curves, space=b"RGB ", name="Made up"):
     """A profile with one curve for each channel, or the same one for all."""
     names = (b"kTRC",) if space == b"GRAY" else (b"rTRC", b"gTRC", b"bTRC")
     text = name.encode("utf-16-be")
@@ -62,7 +59,7 @@ def profile(*curves: bytes, space: bytes = b"RGB ", name: str = "Made up") -> by
     )
 
 
-def write(path: Path, icc: bytes | None, pixels: NDArray[Any] = PIXELS) -> Path:
+def write(path, icc, pixels=PIXELS):
     if path.suffix == ".tif":
         tifffile.imwrite(path, pixels, photometric="rgb", iccprofile=icc)
     elif path.suffix == ".jpg":
@@ -79,7 +76,7 @@ SRGB_PARAMETERS = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
 
 
 @pytest.mark.parametrize(
-    ("icc", "expected"),
+    "icc, expected",
     [
         (SRGB_PROFILE, None),
         (profile(para(3, *SRGB_PARAMETERS)), None),
@@ -99,7 +96,7 @@ def test_curves_with_a_name(icc, expected):
 
 
 @pytest.mark.parametrize(
-    ("curve", "expected"),
+    "curve, expected",
     [
         (para(1, 2, 0.9, 0.1), lambda x: (0.9 * x + 0.1) ** 2),
         (para(2, 2, 0.8, 0.1, 0.05), lambda x: (0.8 * x + 0.1) ** 2 + 0.05),
@@ -161,7 +158,7 @@ def test_many_parts_in_a_jpeg(tmp_path):
     assert read_header(tmp_path / "a.jpg").curve == StatedCurve(None, "JPEG", unread=True)
 
 
-def capture(folder: Path, icc: bytes | None, pixels: NDArray[Any], suffix: str) -> Path:
+def capture(folder, icc, pixels, suffix):
     folder.mkdir()
     for number in range(4):
         write(folder / f"{number}{suffix}", icc, (pixels * (1 - number / 10)).astype(np.uint16))
@@ -176,7 +173,7 @@ def test_a_capture_is_read_with_the_curve_of_its_profile(tmp_path, suffix):
     linear = read_capture(
         capture(tmp_path / "linear", profile(curv(256)), PIXELS, suffix), as_stored=True
     )
-    assert "display_decoded" not in [warning.code for warning in linear.warnings]
+    assert "display_decoded" not in codes(linear)
     plain = read_capture(capture(tmp_path / "plain", None, PIXELS, suffix), as_stored=True)
     np.testing.assert_array_equal(linear.observations, plain.observations)
     expected = np.mean((PIXELS.reshape(-1, 3) / 65535) ** 2.1992, axis=1)
@@ -193,7 +190,7 @@ def test_profiles_that_differ_or_cannot_be_read(tmp_path):
     write(folder / "2.png", profile(curv(563)))
     source = open_capture(folder)
     assert source.radiometry.curve == 1
-    assert [warning.code for warning in source.warnings] == ["display_encoded"]
+    assert codes(source) == ["display_encoded"]
     unread = open_capture(capture(tmp_path / "b", profile(b"mft2" + bytes(40)), PIXELS, ".png"))
     (warning,) = unread.warnings
     assert "The colour profile of 0.png has no curve" in str(warning) and "Add --transfer" in str(

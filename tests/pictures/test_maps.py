@@ -5,13 +5,11 @@ PNG files keep every value; curves leave out what was not computed, and anything
 """
 
 from functools import cache
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
-from numpy.typing import NDArray
 
 from scenes import decode_rgb
 from splinecli.errors import OutputError
@@ -115,7 +113,7 @@ def test_the_bar_runs_from_0_to_the_top(shape):
     assert (picture[:, -1] == 255).all()
 
 
-COLUMNS: dict[str, list[float | None]] = {
+COLUMNS = {
     "step": [50, 100, 125],
     "loss": [2.0, 1.0, 0.5],
     "symmetric": [None, 0.5, None],
@@ -127,7 +125,7 @@ COLUMNS: dict[str, list[float | None]] = {
 }
 
 
-def lines(axes: Any) -> dict[str, list[list[float]]]:
+def lines(axes):
     return {
         line.get_label(): [list(map(float, values)) for values in line.get_data()]
         for line in axes.lines
@@ -171,9 +169,7 @@ def test_a_name_that_is_not_printable_or_a_formula(name):
     assert sky_plot(LIGHTS, name) != sky_plot(LIGHTS, "")
 
 
-def draw(
-    height: int, width: int, methods: list[str], error_deg: float = 12.0, title: str = "title"
-) -> NDArray[np.uint8]:
+def draw(height, width, methods, error_deg=12.0, title="title"):
     """A mask that leaves a margin of two pixels free, ground truth (0, 0, 1), estimates along (1,
     0, 1).
     """
@@ -188,9 +184,7 @@ def draw(
     return decode_rgb(method_maps(truth, mask, estimates, error_maps, title=title))
 
 
-def places_of(
-    colour: tuple[int, ...], picture: NDArray[np.uint8]
-) -> list[tuple[int, int, int, int]]:
+def places_of(colour, picture):
     """Boxes (top, left, height, width) of the large connected areas of a colour, from the left."""
     _, _, boxes, _ = cv2.connectedComponentsWithStats(
         (picture == colour).all(axis=2).astype(np.uint8)
@@ -202,12 +196,12 @@ BLUE = (128, 128, 255)  # of (0, 0, 1)
 TILTED = (218, 128, 218)  # of (1, 0, 1) / sqrt 2
 
 
-def error_colour(error_deg: float) -> tuple[int, ...]:
+def error_colour(error_deg):
     return tuple(int(value) for value in colour_errors(np.array([[error_deg]]))[0, 0])
 
 
 @pytest.mark.parametrize("n_methods", [1, 2, 9])
-@pytest.mark.parametrize(("height", "width"), [(10, 10), (300, 200), (40, 120), (120, 40)])
+@pytest.mark.parametrize("height, width", [(10, 10), (300, 200), (40, 120), (120, 40)])
 def test_colours_stand_where_they_belong(height, width, n_methods):
     picture = draw(height, width, [f"method {i}" for i in range(n_methods)])
     [truth] = places_of(BLUE, picture)
@@ -258,14 +252,7 @@ CELL_YELLOW, CELL_VIOLET, GRAY = ((253, 231, 36), (68, 1, 84), (217, 217, 217))
 
 
 @cache
-def draw_cells(
-    n_pixels: int,
-    *,
-    with_truth: bool = True,
-    with_dense: bool = True,
-    named: bool = True,
-    grid: str = "even",
-) -> NDArray[np.uint8]:
+def draw_cells(n_pixels, *, with_truth=True, with_dense=True, named=True):
     """RGB (H, W, 3). Sparse maps have a one at row 1, column 5; dense maps are zeros; the truth is
     empty.
     """
@@ -278,12 +265,12 @@ def draw_cells(
         pixels=np.array([[12, 34]] * n_pixels) if named else None,
         error_deg=np.full(n_pixels, 3.25),
         title="$cat$, 10 lights" if named else "",
-        grid=grid,
+        grid="even",
     )
     return decode_rgb(png)
 
 
-def boxes(picture: NDArray[np.uint8], colour: tuple[int, int, int]) -> list[NDArray[np.int32]]:
+def boxes(picture, colour):
     """Left, top, width, height of the areas of a colour that are as large as a cell, downwards."""
     same = (np.abs(picture.astype(int) - colour).max(axis=2) <= 2).astype(np.uint8)
     _, _, stats, _ = cv2.connectedComponentsWithStats(same)

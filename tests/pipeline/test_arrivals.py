@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from scenes import put
 from splinecli.errors import InputError
 from splinecli.pipeline import incoming
 from splinecli.pipeline.incoming import Arrivals
@@ -13,13 +14,8 @@ from splinecli.pipeline.incoming import Arrivals
 class Clock:
     seconds = 0.0
 
-    def __call__(self) -> float:
+    def __call__(self):
         return self.seconds
-
-
-def put(path: Path, content: str = "image") -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(content)
 
 
 def test_a_capture_is_complete_when_nothing_changes_for_some_time(tmp_path):
@@ -86,7 +82,7 @@ def test_a_marker_needs_no_time(tmp_path):
     arrivals = Arrivals(tmp_path, marker="done", seconds=5, without=tmp_path / "out", clock=Clock())
     put(tmp_path / "part/1.png")
     assert arrivals.take() == []
-    put(tmp_path / "part/done", "")
+    put(tmp_path / "part/done")
     assert arrivals.take() == [tmp_path / "part"]
     assert arrivals.take() == []
 

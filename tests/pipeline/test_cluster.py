@@ -5,12 +5,10 @@ captures.
 import json
 import re
 import socket
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -38,39 +36,39 @@ GB = 10**9
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Any]:
+def cluster():
     """Two worker processes of 4 GB. A worker that is killed is replaced."""
     with distribution_module._local_cluster(ClusterOptions(workers=2)) as cluster:
         yield cluster
 
 
 @pytest.fixture
-def client(cluster: Any) -> Iterator[Any]:
+def client(cluster):
     with distributed.Client(cluster, set_as_default=False) as client:
         yield client
 
 
 @pytest.fixture(autouse=True)
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture
-def work(tmp_path: Path) -> Callable[..., Work]:
+def work(tmp_path):
     (tmp_path / "probe").touch()
 
-    def make(do: Callable[..., Any]) -> Work:
+    def make(do):
         return Work(partial(do, str(tmp_path)), str(tmp_path / "probe"))
 
     return make
 
 
-def run(client: Any, work: Work, items: list[WorkItem], **options: Any) -> dict[int, Any]:
+def run(client, work, items, **options):
     distributor = Distributor(client, work, ClusterOptions(**options), SILENT)
     return {item.args[0]: result for item, result in distributor.run(items)}
 
 
-def numbered(numbers: range, memory: float = 0) -> list[WorkItem]:
+def numbered(numbers, memory=0):
     return [WorkItem((number,), f"task{number}", memory) for number in numbers]
 
 
@@ -153,7 +151,7 @@ def test_gpu_workers_only(client, work):
         client.run(worker_tasks.set_resources, GPU=0)
 
 
-def write_captures(names: list[str]) -> list[str]:
+def write_captures(names):
     """Write small captures of different content into the working folder; `broken` has no images."""
     lights = unit(
         np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1)], float)
@@ -164,7 +162,7 @@ def write_captures(names: list[str]) -> list[str]:
     return names
 
 
-def results_in(folder: str) -> dict[str, bytes]:
+def results_in(folder):
     files = {str(path.relative_to(folder)): path.read_bytes() for path in Path(folder).glob("*/*")}
     measured = rb'"(seconds": \{[^}]*\}|peak_memory_mib": [0-9.]+)'
     return {name: re.sub(measured, b"", files[name]) for name in files}
@@ -233,8 +231,8 @@ def test_other_weights_on_a_worker(cluster, tmp_path, monkeypatch):
 
 def test_no_scheduler(monkeypatch):
     Path("broken.json").write_text("{}")
-    monkeypatch.setattr(distribution_module, "_CONNECT_SECONDS", 0.2)
-    monkeypatch.setattr(distribution_module, "_ANSWER_SECONDS", 0.2)
+    monkeypatch.setattr(distribution_module, "CONNECT_SECONDS", 0.2)
+    monkeypatch.setattr(distribution_module, "ANSWER_SECONDS", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as server:  # no scheduler
         addresses = [
             "tcp://127.0.0.1:1",
@@ -268,21 +266,10 @@ def test_trials_on_workers(cluster, tmp_path, monkeypatch, capfd):
     for name in names[:3]:
         np.save(f"{name}/normals_gt.npy", np.float32(np.broadcast_to([0, 0, 1], (12, 15, 3))))
     Path("data/damaged/002.png").write_bytes(b"no picture")
-    call = [
-        "evaluate",
-        "data",
-        "--method",
-        "ls",
-        "--method",
-        "iw12",
-        "--n-lights",
-        "3",
-        "--n-lights",
-        "all",
-    ]
+    call = "evaluate data --method ls --method iw12 --n-lights 3 --n-lights all"
 
     def results(output, *more):
-        assert main([*call, "-o", output, *more]) == 3
+        assert main([*call.split(), "-o", output, *more]) == 3
         document = read_json(Path(output, "results.json"))
         text = re.sub(r'"seconds[a-z_]*": [0-9.e-]+', "", json.dumps(document))
         return text, capfd.readouterr().err, Path(output, "trials.jsonl").read_text().count("\n")

@@ -2,11 +2,10 @@
 
 import time
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from scenes import Teacher, cap_directions, spiral_lights
 from splinecli.capture import Capture
@@ -39,9 +38,7 @@ class Slow(Teacher):
     random: bool = False
     seconds: float = 0.0
 
-    def estimate_with_error(
-        self, observations: Any, light_directions: Any, *, progress: Any = None
-    ) -> Any:
+    def estimate_with_error(self, observations, light_directions, *, progress=None):
         self.asked += len(observations)
         time.sleep(self.seconds)
         errors = np.tile(np.float32((np.log(np.radians(3)), 0.7)), (len(observations), 1))
@@ -50,8 +47,8 @@ class Slow(Teacher):
         return LeastSquares().estimate(observations, light_directions), errors
 
 
-def capture(count: int) -> Capture:
-    observations: NDArray[Any] = cap_directions(count, 40) @ LIGHTS.T
+def capture(count):
+    observations = cap_directions(count, 40) @ LIGHTS.T
     return Capture("matte", observations, LIGHTS, tuple(range(6)), np.ones((1, count), bool))
 
 

@@ -1,19 +1,16 @@
 """All commands prepare a capture alike: the same warnings and the same normals, whatever it is."""
 
 import warnings
-from collections.abc import Callable
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
-from numpy.typing import NDArray
 
 import splinecli
 from scenes import (
     BUMP_LAMPS,
-    Floats,
+    codes,
     evaluate,
     read_image,
     shade,
@@ -30,14 +27,13 @@ from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions, InfoOptions, ReadingOptions
 from splinecli.pipeline.info import describe_capture
 
-Images = NDArray[np.uint16]
 LIGHTS = spiral_lights(12, 50, 15)
 NORMALS, MASK = sphere(64, 0.9)
 WHITE, TUNGSTEN = (1.0, 1.0, 1.0), (1.0, 0.75, 0.5)
 LAMPS = np.tile([WHITE, TUNGSTEN], (6, 1))
 
 
-def paint(*colours: tuple[float, float, float]) -> Floats:
+def paint(*colours):
     """Stripes (H, W, 3) of these colours, with some texture."""
     stripes = np.array(colours)[np.arange(64) // 8 % len(colours)]
     grain = np.random.default_rng(1).uniform(0.8, 1, (64, 64, 1))
@@ -49,7 +45,7 @@ STRONG = paint((0.9, 0.2, 0.1), (0.1, 0.3, 0.9))
 GRAY = paint(WHITE)
 
 
-def photograph(albedo: Floats, lamps: Floats | None = None, gloss: float = 0.0) -> Images:
+def photograph(albedo, lamps=None, gloss=0.0):
     """Return 16-bit images (F, H, W, 3) of the ball, of which the brightest value is at 60,000."""
     lamps = np.ones((12, 3)) if lamps is None else lamps
     shading = np.where(MASK[..., None], shade(NORMALS, LIGHTS, gloss=gloss), 0)
@@ -57,12 +53,12 @@ def photograph(albedo: Floats, lamps: Floats | None = None, gloss: float = 0.0) 
     return to_uint16(images / images.max() * 60_000)
 
 
-def write(folder: Path, images: NDArray[np.generic], **more: NDArray[np.generic] | None) -> Path:
+def write(folder, images, **more):
     given = {"mask": MASK, "normals": NORMALS.astype(np.float32), **more}
     return write_capture(folder, images, LIGHTS, **given)
 
 
-def moved(images: Images) -> Images:
+def moved(images):
     """Return the images, of which three are shifted by some pixels."""
     found = images.copy()
     for place, shift in ((2, (3, -2)), (5, (-2, 4)), (9, (4, 3))):
@@ -70,26 +66,26 @@ def moved(images: Images) -> Images:
     return found
 
 
-def clipped(images: Images) -> Images:
+def clipped(images):
     return np.where(images > 30_000, 65_535, images * 2).astype(np.uint16)
 
 
-def eight_bits(images: Images) -> NDArray[np.uint8]:
+def eight_bits(images):
     return np.rint(images / 257).astype(np.uint8)
 
 
-def blurred(images: Images) -> Images:
+def blurred(images):
     return np.stack([cv2.GaussianBlur(image, (0, 0), 0.9) for image in images])
 
 
-def near_lamps(folder: Path) -> Path:
+def near_lamps(folder):
     write_bump(folder)
     rows = "\n".join(" ".join(map(str, lamp)) for lamp in BUMP_LAMPS)
     (folder / "light_positions.txt").write_text(f"{rows}\n")
     return folder
 
 
-STILL: dict[str, Callable[[Path], Path]] = {
+STILL = {
     "plain": lambda folder: write(folder, photograph(GRAY)),
     "glossy": lambda folder: write(folder, photograph(GRAY, gloss=0.4)),
     "coloured lamps": lambda folder: write(folder, photograph(SOFT, LAMPS)),
@@ -112,7 +108,7 @@ STILL: dict[str, Callable[[Path], Path]] = {
     ),
     "near lamps": near_lamps,
 }
-OTHERS: dict[str, Callable[[Path], Path]] = {
+OTHERS = {
     "moved": lambda folder: write(folder, moved(photograph(GRAY))),
     "moved under coloured lamps": lambda folder: write(folder, moved(photograph(SOFT, LAMPS))),
     "black image": lambda folder: write(
@@ -121,59 +117,32 @@ OTHERS: dict[str, Callable[[Path], Path]] = {
 }
 
 
-def reading_of(name: str) -> dict[str, object]:
-    """Return the options that a capture needs to be read."""
-    return {"pixel_size": 2.0} if name == "near lamps" else {}
-
-
-@pytest.mark.parametrize("auto_mask", [False, True], ids=["", "auto-mask"])
 @pytest.mark.parametrize("name", [*STILL, *OTHERS])
-def test_infer_and_info_give_the_same_warnings(tmp_path, name, auto_mask):
+def test_all_commands_agree(tmp_path, name):
+    """The warnings of info, the error of evaluate and the normals of Python are those of infer."""
     folder = (STILL | OTHERS)[name](tmp_path / "capture")
-    options = InferOptions(
-        method="ls", output=str(tmp_path), auto_mask=auto_mask, **reading_of(name)
-    )
-    report = infer_capture(folder, options)
-    reading = ReadingOptions(**reading_of(name))
-    info = describe_capture(InfoOptions(capture=folder, auto_mask=auto_mask), reading)
-    assert info["warnings"] == [warning["text"] for warning in report["warnings"]]
-    assert info["warning_codes"] == [warning["code"] for warning in report["warnings"]]
-    assert info["n_pixels"] == report["n_pixels"]
-
-
-def test_the_colours_of_lamps_are_found_on_a_small_object(tmp_path):
-    folder = STILL["small under coloured lamps"](tmp_path / "capture")
-    for align in (False, True):
-        options = InferOptions(method="ls", output=str(tmp_path), auto_mask=True, align=align)
+    reading = {"pixel_size": 2.0} if name == "near lamps" else {}
+    for auto_mask in (False,) if (folder / "mask.png").exists() else (True, False):
+        out = tmp_path / str(auto_mask)
+        options = InferOptions(method="ls", output=str(out), auto_mask=auto_mask, **reading)
         report = infer_capture(folder, options)
-        codes = {warning["code"] for warning in report["warnings"]}
-        assert codes == {"estimated_colours", "estimated_intensities"}
-
-
-@pytest.mark.parametrize("name", [*STILL, *OTHERS])
-def test_infer_and_evaluate_give_the_same_error(tmp_path, name):
-    if name in ("near lamps", "small under coloured lamps"):
-        pytest.skip("evaluate has no options of reading, and needs ground truth")
-    folder = (STILL | OTHERS)[name](tmp_path / "capture")
-    report = infer_capture(folder, InferOptions(method="ls", output=str(tmp_path)))
-    (result,) = evaluate([folder], [LeastSquares()], Protocol(None)).results
-    mae_deg = report["angular_error_deg"]["mean"]
-    if name.startswith("moved"):  # evaluate takes the input as it is
-        assert report["mended"] == ["images_shifted"] and mae_deg < result.mae_deg / 2
-    else:
-        assert report["mended"] == []
-        assert result.mae_deg == pytest.approx(mae_deg, abs=1e-3)  # as rounded in the report
-
-
-@pytest.mark.parametrize(
-    "name",
-    [name for name in STILL if name not in ("8 bits", "near lamps", "small under coloured lamps")],
-)
-def test_files_and_arrays_give_the_same_normals(tmp_path, name):
-    folder = STILL[name](tmp_path / "capture")
-    infer_capture(folder, InferOptions(method="ls", output=str(tmp_path)))
-    paths = sorted(folder.glob("[0-9]*.png"))
-    images = [read_image(path) for path in paths]
+        info = describe_capture(
+            InfoOptions(capture=folder, auto_mask=auto_mask), ReadingOptions(**reading)
+        )
+        assert info["warnings"] == [warning["text"] for warning in report["warnings"]]
+        assert info["warning_codes"] == codes(report)
+        assert info["n_pixels"] == report["n_pixels"]
+    if report["angular_error_deg"] and not reading:  # evaluate has no options of reading
+        (result,) = evaluate([folder], [LeastSquares()], Protocol(None)).results
+        mean_deg = report["angular_error_deg"]["mean"]
+        if name.startswith("moved"):  # evaluate takes the input as it is
+            assert report["mended"] == ["images_shifted"] and mean_deg < result.mae_deg / 2
+        else:
+            assert report["mended"] == []
+            assert result.mae_deg == pytest.approx(mean_deg, abs=1e-3)  # as rounded in the report
+    if name in OTHERS or name in ("8 bits", "near lamps", "small under coloured lamps"):
+        return
+    images = [read_image(path) for path in sorted(folder.glob("[0-9]*.png"))]
     stack = np.stack([image if image.ndim == 2 else image[..., ::-1] for image in images])
     known = LAMPS if name == "RGB intensities" else None
     mask = None if name == "without mask" else MASK
@@ -183,50 +152,52 @@ def test_files_and_arrays_give_the_same_normals(tmp_path, name):
         estimate = splinecli.estimate_normals(
             stack, lights, mask, light_intensities=known, method="ls"
         )
-    normals = np.load(tmp_path / "capture" / "normals.npy")
-    assert_array_equal(estimate.normal_map, normals)
+    assert_array_equal(estimate.normal_map, np.load(out / "capture/normals.npy"))
+
+
+def with_and_without_align(tmp_path, name, **options):
+    """Return the warnings and the normals of infer, first without --align."""
+    folder = STILL[name](tmp_path / "capture")
+    for align in (False, True):
+        made = InferOptions(method="ls", output=str(tmp_path), align=align, **options)
+        told = infer_capture(folder, made)["warnings"]
+        yield told, np.load(tmp_path / "capture/normals.npy")
 
 
 @pytest.mark.parametrize("name", ["plain", "coloured lamps", "strongly coloured object", "blurred"])
 def test_aligning_a_still_capture_changes_nothing(tmp_path, name):
-    folder = STILL[name](tmp_path / "capture")
-    found, warned = [], []
-    for align in (False, True):
-        options = InferOptions(method="ls", output=str(tmp_path), align=align)
-        report = infer_capture(folder, options)
-        warned.append(report["warnings"])
-        found.append(np.load(tmp_path / "capture" / "normals.npy"))
-    assert warned[0] == warned[1]
-    assert_array_equal(*found)
+    (told, normals), (again, aligned) = with_and_without_align(tmp_path, name)
+    assert told == again
+    assert_array_equal(normals, aligned)
 
 
-def test_coloured_lamps_leave_nothing_but_their_warning(tmp_path):
+@pytest.mark.parametrize(
+    "name, options",
+    [
+        ("strongly coloured object", {"strict": True}),
+        ("small under coloured lamps", {"auto_mask": True}),
+    ],
+)
+def test_coloured_lamps_leave_nothing_but_their_warning(tmp_path, name, options):
     """The pixels near the middle have no attached shadows, so least squares is exact there."""
-    folder = STILL["strongly coloured object"](tmp_path / "capture")
     inside = cv2.circle(np.zeros((64, 64), np.uint8), (32, 32), 17, 1, cv2.FILLED) > 0
-    for align in (False, True):
-        options = InferOptions(method="ls", output=str(tmp_path), align=align, strict=True)
-        report = infer_capture(folder, options)
-        codes = {warning["code"] for warning in report["warnings"]}
-        assert codes == {"estimated_colours", "estimated_intensities"}
-        normals = np.load(tmp_path / "capture" / "normals.npy")
-        assert angle_between_deg(normals[inside], NORMALS[inside]).mean() < 0.1
+    for told, normals in with_and_without_align(tmp_path, name, **options):
+        assert set(codes(told)) == {"estimated_colours", "estimated_intensities"}
+        if "strict" in options:
+            assert angle_between_deg(normals[inside], NORMALS[inside]).mean() < 0.1
 
 
 @pytest.mark.parametrize("given", [{"as_stored": True}, {"intensities": "equal"}], ids=str)
 def test_colours_that_stay_are_no_motion(tmp_path, given):
-    folder = STILL["strongly coloured object"](tmp_path / "capture")
-    found = []
-    for align in (False, True):
-        options = InferOptions(method="ls", output=str(tmp_path), align=align, **given)
-        infer_capture(folder, options)
-        found.append(np.load(tmp_path / "capture" / "normals.npy"))
-    np.testing.assert_array_equal(*found)
+    (_, normals), (_, aligned) = with_and_without_align(
+        tmp_path, "strongly coloured object", **given
+    )
+    assert_array_equal(normals, aligned)
 
 
 def test_images_that_are_not_used_may_have_another_size(tmp_path):
     folder = STILL["plain"](tmp_path / "capture")
     last = folder / "011.png"
-    cv2.imwrite(str(last), cv2.imread(str(last), cv2.IMREAD_UNCHANGED)[:-4])
+    cv2.imwrite(str(last), read_image(last)[:-4])
     options = {"method": "ls", "output": str(tmp_path), "light_indices": tuple(range(11))}
     assert infer_capture(folder, InferOptions(align=True, **options))["n_lights"] == 11

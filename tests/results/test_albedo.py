@@ -2,8 +2,6 @@
 albedo.
 """
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +10,7 @@ from scenes import read_image, square_grid, to_uint16, write_capture, write_imag
 from splinecli.capture import open_capture
 from splinecli.lights.calibration.balls import find_ball_files
 from splinecli.lights.calibration.lamps import measure_light_intensities
+from splinecli.maths.normals import unit
 from splinecli.recipe import RecipeOptions, prepare_capture
 from splinecli.results.map_values import albedo_map
 
@@ -19,14 +18,15 @@ SIZE = 40
 INTENSITIES = np.array(
     [(1.0, 0.9, 0.8), (0.7, 0.7, 0.7), (0.5, 0.6, 0.7), (1, 1, 1), (0.8, 1, 0.8), (1, 1, 0.5)]
 )
-LIGHTS = np.array(
-    [(0, 0, 1), (0.5, 0, 0.8), (-0.5, 0, 0.8), (0, 0.5, 0.8), (0, -0.5, 0.8), (0.3, 0.3, 0.9)]
+LIGHTS = unit(
+    np.array(
+        [(0, 0, 1), (0.5, 0, 0.8), (-0.5, 0, 0.8), (0, 0.5, 0.8), (0, -0.5, 0.8), (0.3, 0.3, 0.9)]
+    )
 )
-LIGHTS = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)
 
 
 @pytest.fixture
-def scene(tmp_path: Path):
+def scene(tmp_path):
     """Folder, true normals and true albedo of a capture; some pixels have a highlight or a shadow
     under one light.
     """

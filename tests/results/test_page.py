@@ -8,7 +8,6 @@ browser.
 import base64
 import re
 import zlib
-from collections.abc import Sequence
 from unittest import mock
 
 import cv2
@@ -16,9 +15,7 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from numpy.typing import NDArray
 
-from browser import OpenPage
 from html_page import REPORT, SIDE, HtmlPage, ball, light_at
 from scenes import decode_rgb, write_image
 from splinecli.evaluation.document import html_report
@@ -42,14 +39,14 @@ class Page(HtmlPage):
     """The text of a page and its pictures."""
 
     @property
-    def facts(self) -> dict[str, str]:
+    def facts(self):
         return dict(zip(self.text["dt"], self.text["dd"], strict=True))
 
     @property
-    def alternative_texts(self) -> list[str | None]:
+    def alternative_texts(self):
         return [attributes["alt"] for tag, attributes in self.tags if tag == "img"]
 
-    def picture(self, alternative_text: str) -> NDArray[np.uint8]:
+    def picture(self, alternative_text):
         """RGB of the image with this alternative text."""
         (source,) = (
             a["src"] for tag, a in self.tags if tag == "img" and a["alt"] == alternative_text
@@ -61,7 +58,7 @@ class Page(HtmlPage):
         assert picture.shape[2] == 3  # alpha would be multiplied into the rest
         return np.asarray(picture[..., ::-1], np.uint8)
 
-    def normals(self) -> NDArray[np.float64]:
+    def normals(self):
         """Normals (H, W, 3) as the page's script decodes them, zero outside the mask."""
         high, low = self.picture("Normal map").astype(int), self.picture("").astype(int)
         return unit(((high * 32 + low) / 8191 * 2 - 1) * high.any(axis=2, keepdims=True))
@@ -183,9 +180,7 @@ async (fragment) => {
 """
 
 
-def views(
-    open_page: OpenPage, html: str, fragments: Sequence[str], *, webgl: bool = True
-) -> list[NDArray[np.int64]]:
+def views(open_page, html, fragments, *, webgl=True):
     """Screenshots of the view, (SIDE, SIDE, 3) RGB, one screen pixel for each pixel of the map."""
     # At the window's edge the view would be under the place where a headless browser's pointer
     # rests.
@@ -251,9 +246,7 @@ def test_a_glossy_sphere_of_two_colours(open_page):
         assert np.abs(seen - expected).max() <= 3
 
 
-def glossy(
-    n: NDArray[np.floating], light: NDArray[np.floating], exponent: float
-) -> NDArray[np.floating]:
+def glossy(n, light, exponent):
     return np.maximum(n @ unit(light + np.array((0, 0, 1))), 0) ** exponent
 
 
@@ -302,7 +295,7 @@ def test_zoom_shows_a_part_of_the_same_picture(open_page, webgl):
     assert np.abs(seen - expected[..., None])[smooth].max() <= (3 if webgl else 6)
 
 
-def material_of_ball(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+def material_of_ball(mask):
     """Painted on the left, metal on the right, rougher from the top to the bottom; as the pictures
     store it.
     """

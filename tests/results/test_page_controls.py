@@ -1,7 +1,5 @@
 """A page under the user's hands: mouse, keys, fingers and the ruler, in a browser."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -11,14 +9,14 @@ from splinecli.results import pages as page_module
 from splinecli.results.pages import result_page
 
 
-def wait_until(page: Any, condition: str) -> None:
+def wait_until(page, condition):
     """Wait in the page; its policy refuses the polling of Playwright."""
     page.evaluate(
         f"async () => {{ while (!({condition})) await new Promise(requestAnimationFrame); }}"
     )
 
 
-def lights_are(page: Any, x: float, y: float, note: str) -> None:
+def lights_are(page, x, y, note):
     assert_allclose(page.evaluate("splinecli.light"), light_at(x, y), atol=0.02, err_msg=note)
 
 

@@ -8,7 +8,6 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label
 
-from scenes import Floats
 from splinecli.errors import InputError, UsageError
 from splinecli.maths.normals import unit
 from splinecli.surface import integration
@@ -22,27 +21,31 @@ COARSE_FROM = {"own scale": 10**9, "coarse to fine": 300}
 
 
 @pytest.fixture
-def until_nothing_moves(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(integration, "_STILL", 0.0)
-    monkeypatch.setattr(integration, "_SOLVES_OF_COARSEST", 400)
+def no_movement(monkeypatch):
+    monkeypatch.setattr(integration, "STILL", 0.0)
+    monkeypatch.setattr(integration, "SOLVES_OF_COARSEST", 400)
 
 
 @pytest.fixture(params=COARSE_FROM)
-def any_scale(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(integration, "_COARSEST", COARSE_FROM[request.param])
+def scale(request, monkeypatch):
+    monkeypatch.setattr(integration, "COARSEST", COARSE_FROM[request.param])
 
 
-def grid(height: int, width: int) -> tuple[Floats, Floats]:
+until_nothing_moves = pytest.mark.usefixtures("no_movement")
+any_scale = pytest.mark.usefixtures("scale")
+
+
+def grid(height, width):
     """Return x (right) and y (up) of the pixels (H, W), from the centre."""
     rows, columns = np.mgrid[:height, :width].astype(np.float64)
     return columns - (width - 1) / 2, (height - 1) / 2 - rows
 
 
-def normals_of_slopes(along_x: Floats, along_y: Floats) -> Floats:
+def normals_of_slopes(along_x, along_y):
     return unit(np.stack((-along_x, -along_y, np.ones_like(along_x)), axis=-1))
 
 
-def sphere(height: int, width: int, radius: float, reach: float) -> tuple[Floats, Mask, Floats]:
+def sphere(height, width, radius, reach):
     """Return normals, mask and heights of the cap within `reach` of the radius, not centred on a
     pixel.
     """
@@ -53,7 +56,7 @@ def sphere(height: int, width: int, radius: float, reach: float) -> tuple[Floats
     return np.stack((x, y, z), axis=-1) / radius * mask[..., None], mask, z
 
 
-def bumps(height: int, width: int, seed: int = 0, *, usable: bool = False) -> Floats:
+def bumps(height, width, seed=0, *, usable=False):
     """Return normals that no surface has: smooth with noise, some nearly grazing, some facing away
     unless `usable`.
     """
@@ -67,9 +70,9 @@ def bumps(height: int, width: int, seed: int = 0, *, usable: bool = False) -> Fl
     return normals
 
 
-def holes(height: int, width: int, seed: int = 1) -> Mask:
+def holes(height, width, seed=1):
     """Return a ragged mask of several parts, with strips one pixel wide and single pixels."""
-    mask: Mask = np.random.default_rng(seed).uniform(size=(height, width)) < 0.7
+    mask = np.random.default_rng(seed).uniform(size=(height, width)) < 0.7
     mask[:, width // 2] = False
     mask[1, :] = True
     mask[2, :] = mask[4, :] = False
@@ -77,15 +80,15 @@ def holes(height: int, width: int, seed: int = 1) -> Mask:
     return mask
 
 
-def error_share(found: Floats, truth: Floats, mask: Mask) -> float:
+def error_share(found, truth, mask):
     """Return the mean error without the offset, as a share of the range of the truth."""
     error = (found - truth)[mask]
     return float(np.abs(error - np.median(error)).mean() / np.ptp(truth[mask]))
 
 
-@pytest.mark.usefixtures("any_scale")
+@any_scale
 @pytest.mark.parametrize("discontinuity", [0, 2])
-@pytest.mark.parametrize(("reach", "limit"), [(0.6, 1e-4), (0.9, 2e-4), (1.0, 1e-3)])
+@pytest.mark.parametrize("reach, limit", [(0.6, 1e-4), (0.9, 2e-4), (1.0, 1e-3)])
 def test_sphere(reach, limit, discontinuity):
     # Up to the rim, where normals are grazing, the last pixel is off by more.
     normals, mask, truth = sphere(130, 150, 60, reach)
@@ -95,9 +98,7 @@ def test_sphere(reach, limit, discontinuity):
     assert found[mask].mean() == pytest.approx(0, abs=1e-9)
 
 
-def levels(
-    rows: int, columns: int, height: float, slope: float, joined: int
-) -> tuple[Floats, Floats, Mask]:
+def levels(rows, columns, height, slope, joined):
     """Return normals and heights of two flat levels, and the mask of the wall between them.
 
     In the first `joined` rows, a ramp connects the levels. The wall is one pixel thick and faces
@@ -118,11 +119,11 @@ def levels(
 @pytest.mark.parametrize("joined", [30, 70])
 @pytest.mark.parametrize("coarse_from", [10**9, 3000])
 def test_levels_apart(monkeypatch, coarse_from, joined):
-    monkeypatch.setattr(integration, "_COARSEST", coarse_from)
+    monkeypatch.setattr(integration, "COARSEST", coarse_from)
     normals, truth, wall = levels(100, 120, 30, 2, joined)
     everywhere = np.ones(wall.shape, bool)
     least_squares = integrate_normals(normals, everywhere, discontinuity=0)
-    done: list[float] = []
+    done = []
     torn = integrate_normals(normals, everywhere, progress=done.append)
     assert error_share(least_squares, truth, ~wall) > 0.1
     assert error_share(torn, truth, ~wall) < 1e-2
@@ -143,7 +144,7 @@ def test_plane_is_exact(shape, slopes):
         assert_allclose(found, slopes[0] * x + slopes[1] * y, atol=atol, rtol=0)
 
 
-def seen(camera: Floats, height: int, width: int) -> Floats:
+def seen(camera, height, width):
     """Return the points (H, W, 3) at depth 1 that the pixels show, by hand, for a camera without
     skew.
     """
@@ -152,7 +153,7 @@ def seen(camera: Floats, height: int, width: int) -> Floats:
     return np.stack((x, -down, -np.ones_like(x)), axis=-1)
 
 
-@pytest.mark.usefixtures("any_scale")
+@any_scale
 def test_perspective_plane():
     rays, mask = seen(CAMERA, 90, 120), np.ones((90, 120), bool)
     normal = unit(np.array([0.3, -0.4, 0.8]))
@@ -169,7 +170,7 @@ def test_perspective_plane():
     )
 
 
-@pytest.mark.usefixtures("any_scale")
+@any_scale
 def test_perspective_sphere():
     rays = seen(CAMERA, 90, 120)
     centre, radius = np.array([0.1, -0.05, -6.0]), 1.1
@@ -186,7 +187,7 @@ def test_perspective_sphere():
     assert error_share(found * scale, depth, mask) < 5e-3
 
 
-def equations(normals: Floats, mask: Mask) -> tuple[list[Floats], list[Floats]]:
+def equations(normals, mask):
     """Return matrices (P, P) and constants (P,) of facing * (h' - h) + slant to the right, left,
     bottom and top.
 
@@ -208,7 +209,7 @@ def equations(normals: Floats, mask: Mask) -> tuple[list[Floats], list[Floats]]:
     return matrices, constants
 
 
-def dense(normals: Floats, mask: Mask, discontinuity: float, iterations: int) -> Floats:
+def dense(normals, mask, discontinuity, iterations):
     """Return the heights (P,) by the pseudo-inverse, which have mean 0 in every part."""
     matrices, constants = equations(normals, mask)
     heights = np.zeros(np.count_nonzero(mask))
@@ -256,7 +257,7 @@ def test_a_prior_is_the_dense_solution():
     assert_allclose(means, prior[mask][known].mean(), atol=1e-9)
 
 
-def drifting(seed: int = 0) -> tuple[Floats, Floats, Floats]:
+def drifting(seed=0):
     """Return normals with smooth errors of 4 degrees and noise of 2, heights, and a coarse, noisy
     scan of these.
     """
@@ -274,7 +275,7 @@ def drifting(seed: int = 0) -> tuple[Floats, Floats, Floats]:
 
 
 @pytest.mark.parametrize("discontinuity", [0.0, 2.0])
-@pytest.mark.usefixtures("any_scale")
+@any_scale
 def test_a_prior_is_better_than_normals_and_scan_alone(discontinuity):
     normals, heights, scan = drifting()
     scan[80:95, 60:120] = np.nan
@@ -300,7 +301,7 @@ def test_a_prior_in_another_direction_or_unit():
         assert stated and float(stated[1]) == pytest.approx(factor, rel=0.2)
 
 
-@pytest.mark.usefixtures("until_nothing_moves")
+@until_nothing_moves
 def test_bilateral_is_the_dense_solution():
     normals, mask = bumps(12, 17, usable=True), holes(12, 17)
     found = integrate_normals(normals, mask)[mask]
@@ -310,7 +311,7 @@ def test_bilateral_is_the_dense_solution():
     assert_allclose(found, expected, atol=5e-3)
 
 
-@pytest.mark.usefixtures("any_scale")
+@any_scale
 @pytest.mark.parametrize("camera", [None, CAMERA])
 def test_single_pixels_and_normals_that_are_not_usable(camera):
     normals, mask = bumps(12, 17), holes(12, 17)
@@ -326,7 +327,7 @@ def test_single_pixels_and_normals_that_are_not_usable(camera):
     assert_allclose(found[mask], middle, atol=1e-9)
 
 
-@pytest.mark.usefixtures("any_scale")
+@any_scale
 def test_backward_normals_are_bridged():
     normals, mask, truth = sphere(60, 80, 40, 0.8)
     wrong = np.random.default_rng(3).uniform(size=mask.shape) < 0.05
@@ -335,7 +336,7 @@ def test_backward_normals_are_bridged():
     assert error_share(found, truth, mask) < 5e-3
 
 
-@pytest.mark.usefixtures("until_nothing_moves")
+@until_nothing_moves
 def test_turning_the_picture_turns_the_surface():
     normals, mask = bumps(18, 25, 4), holes(18, 25, 5)
     x, y, z = np.moveaxis(normals, -1, 0)
@@ -360,7 +361,7 @@ ZERO_AT_1_2 = NORMALS * ~((np.arange(3)[:, None, None] == 1) & (np.arange(4)[:, 
 
 
 @pytest.mark.parametrize(
-    ("arguments", "options", "error", "message"),
+    "arguments, options, error, message",
     [
         ((NORMALS[..., 0],), {}, UsageError, "(3, 4), expected (H, W, 3)"),
         ((NORMALS * 0,), {}, InputError, "the normal map has no normal"),
@@ -421,7 +422,7 @@ def test_errors_of_the_normals_tear_less_than_with_the_published_weights():
 
 
 @pytest.mark.parametrize(
-    ("wave", "kept"), [(16, 1 / (1 + (16 / 64) ** 2)), (64, 0.5), (256, 1 / (1 + 4**2))]
+    "wave, kept", [(16, 1 / (1 + (16 / 64) ** 2)), (64, 0.5), (256, 1 / (1 + 4**2))]
 )
 def test_of_a_wave_the_stated_share_is_kept(wave, kept):
     x = np.broadcast_to(np.arange(512), (96, 512))

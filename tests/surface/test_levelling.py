@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from scenes import Floats, read_json
+from scenes import read_json
 from splinecli.errors import UsageError
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.pipeline.integrate import integrate_normal_map
@@ -16,7 +16,7 @@ SLOPES = 0.2, -0.1
 MASK = np.ones((60, 80), np.bool_)
 
 
-def plate(slopes: tuple[float, float] = SLOPES, aspect: float = 1.0) -> tuple[Floats, Floats]:
+def plate(slopes=SLOPES, aspect=1.0):
     """Return heights (60, 80) and normals of a plate with a bump on a fifth of it; pixels are
     `aspect` high.
     """

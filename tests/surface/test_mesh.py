@@ -2,19 +2,16 @@
 measured normals.
 """
 
-from typing import Any
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from glb_file import read_glb
-from scenes import Floats
 from splinecli.errors import UsageError
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.pixel_grid import Blocks
 from splinecli.surface import mesh as mesh_module
-from splinecli.surface.mesh import SurfaceMesh, Textures, decimated_mesh, surface_mesh
+from splinecli.surface.mesh import Textures, decimated_mesh, surface_mesh
 from splinecli.surface.surface_files import Surface, encode_surface
 
 CAMERA = np.array([[100.0, 0.0, 9.0], [0.0, 110.0, 7.0], [0.0, 0.0, 1.0]])
@@ -27,7 +24,7 @@ RAGGED = np.random.default_rng(1).uniform(size=(15, 20)) < 0.8
 RAGGED[3, 4] = True
 
 
-def face_normals(mesh: SurfaceMesh) -> Floats:
+def face_normals(mesh):
     """Twice the area long (T, 3)."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.triangles].astype(np.float64), 1, 0)
     return np.cross(b - a, c - a)
@@ -106,8 +103,8 @@ def test_attributes_of_vertices(camera):
     normal_map[3, 4] = (0.6, 0, 0.8)
     mesh = surface_mesh(50 + WAVE, mask, camera, normal_map=normal_map)
     mesh = Textures(colours).put_on(mesh, mask)
-    np.testing.assert_array_equal(mesh.normals, normal_map[mask].astype(np.float32))
-    np.testing.assert_array_equal(mesh.colours, colours[mask])
+    assert_array_equal(mesh.normals, normal_map[mask].astype(np.float32))
+    assert_array_equal(mesh.colours, colours[mask])
     rows, columns = np.nonzero(mask)
     expected = np.stack(((columns + 0.5) / 20, (rows + 0.5) / 15), axis=1)
     assert_allclose(mesh.uvs, expected, atol=1e-6)
@@ -149,7 +146,7 @@ SIDE = 90
 CAMERA_OF_SPHERE = np.array([[120.0, 0.0, 40.0], [0.0, 130.0, 47.0], [0.0, 0.0, 1.0]])
 
 
-def measured(columns: Floats, rows: Floats) -> Floats:
+def measured(columns, rows):
     """Return the normals (..., 3) of a dome with relief that is finer than the triangles will
     be.
     """
@@ -159,11 +156,11 @@ def measured(columns: Floats, rows: Floats) -> Floats:
     return unit(np.stack((x, y, np.ones_like(x)), axis=-1))
 
 
-def height_of_dome(columns: Floats, rows: Floats) -> Floats:
+def height_of_dome(columns, rows):
     return np.asarray(np.sqrt(np.maximum(60.0**2 - (columns - 44.5) ** 2 - (rows - 44.5) ** 2, 0)))
 
 
-def dome(camera: Floats | None, odd: int = 0) -> tuple[tuple[Any, ...], Floats]:
+def dome(camera, odd=0):
     """Return what surface_mesh takes of the shape of a dome alone, and the normal map with the
     relief.
     """
@@ -178,12 +175,12 @@ def dome(camera: Floats | None, odd: int = 0) -> tuple[tuple[Any, ...], Floats]:
 @pytest.fixture(
     scope="module", params=[None, CAMERA_OF_SPHERE], ids=["orthographic", "perspective"]
 )
-def camera(request: pytest.FixtureRequest) -> Any:
+def camera(request):
     return request.param
 
 
 @pytest.fixture(scope="module")
-def decimated(camera: Floats | None) -> SurfaceMesh:
+def decimated(camera):
     surface, normal_map = dome(camera)
     return decimated_mesh(
         *surface, n_triangles=len(surface_mesh(*surface).triangles) // 20, normal_map=normal_map

@@ -2,19 +2,17 @@
 
 import io
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
-from numpy.typing import NDArray
 from PIL import Image
 
 from glb_file import read_glb
 from splinecli.errors import InputError
 from splinecli.maths.transfer import decode_transfer
-from splinecli.surface.mesh import SurfaceMesh, Textures, surface_mesh
+from splinecli.surface.mesh import Textures, surface_mesh
 from splinecli.surface.surface_files import GRAY, Surface, encode_surface
 
 SHAPE = (15, 20)
@@ -22,18 +20,16 @@ DEPTH = 3 * np.sin(np.arange(20) / 4) + np.arange(15)[:, None] / 5
 COLOURS = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3), np.uint8)
 
 
-def wave(coloured: bool = True, mask: NDArray[np.bool_] | None = None) -> SurfaceMesh:
+def wave(coloured=True, mask=None):
     mask = np.ones(SHAPE, bool) if mask is None else mask
     return Textures(COLOURS if coloured else None).put_on(surface_mesh(DEPTH, mask), mask)
 
 
-def encode(
-    mesh: SurfaceMesh, form: str, *, unit: str = "pixel", millimetres: float = 1.0
-) -> dict[str, bytes]:
+def encode(mesh, form, *, unit="pixel", millimetres=1.0):
     return dict(encode_surface(Surface(DEPTH, mesh, unit, millimetres), [form]))
 
 
-def load(content: bytes, form: str) -> Any:
+def load(content, form):
     return trimesh.load_mesh(
         io.BytesIO(content), file_type=form, process=False, maintain_order=True
     )
@@ -67,7 +63,7 @@ def test_obj(coloured, tmp_path):
     assert sorted(files) == ["mesh.mtl", "mesh.obj", *(["mesh.png"] if coloured else [])]
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
-    read: Any = trimesh.load_mesh(tmp_path / "mesh.obj", process=False, maintain_order=True)
+    read = trimesh.load_mesh(tmp_path / "mesh.obj", process=False, maintain_order=True)
     assert_allclose(read.vertices, mesh.vertices, atol=1e-6)
     assert_array_equal(read.faces, mesh.triangles)
     normals = [
@@ -106,7 +102,7 @@ def test_glb(coloured):
     assert len(read.faces) == len(mesh.triangles)
 
 
-def glossy(specular: NDArray[np.floating]) -> SurfaceMesh:
+def glossy(specular):
     gloss = np.dstack((np.full(SHAPE, 255), np.full(SHAPE, 102), np.zeros(SHAPE))).astype(np.uint8)
     return replace(
         wave(), gloss=gloss, specular=np.broadcast_to(specular, SHAPE).astype(np.float32)
@@ -159,7 +155,7 @@ def test_gloss_of_obj(tmp_path):
     # the mirror direction.
     assert float(lines["Ks"].split()[0]) == pytest.approx(0.04 / (4 * 0.4**4), abs=0.003)
     assert float(lines["Ns"]) == pytest.approx(2 / 0.4**4 - 2)
-    read: Any = trimesh.load_mesh(tmp_path / "mesh.obj", process=False, maintain_order=True)
+    read = trimesh.load_mesh(tmp_path / "mesh.obj", process=False, maintain_order=True)
     assert_array_equal(np.asarray(read.visual.material.image), COLOURS)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from scenes import put
 from splinecli.errors import UsageError
 from splinecli.system import machine
 from splinecli.system.machine import (
@@ -18,7 +19,7 @@ from splinecli.system.machine import (
 
 
 @pytest.mark.parametrize(
-    ("name", "available", "chosen"),
+    "name, available, chosen",
     [("auto", True, "cuda"), ("auto", False, "cpu"), ("cpu", True, "cpu"), ("cuda", True, "cuda")],
 )
 def test_choice(monkeypatch, name, available, chosen):
@@ -27,7 +28,7 @@ def test_choice(monkeypatch, name, available, chosen):
 
 
 @pytest.mark.parametrize(
-    ("name", "problem"),
+    "name, problem",
     [("gpu", "no device named 'gpu'; expected auto, cpu or cuda"), ("cuda", "no CUDA device")],
 )
 def test_devices_that_are_not_there(monkeypatch, name, problem):
@@ -45,23 +46,18 @@ def test_automatic_precision_agrees_with_the_kernel_s_list_of_instructions():
     assert choose_precision("auto", torch.device("cpu")) == ("bfloat16" if native else "float32")
 
 
-def write(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
-
-
 @pytest.fixture
-def mount(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def mount(tmp_path, monkeypatch):
     """The folder of control groups, beside the file `groups` that says in which ones this process
     is.
     """
-    monkeypatch.setattr(machine, "_GROUPS", tmp_path / "groups")
-    monkeypatch.setattr(machine, "_MOUNT", tmp_path / "mount")
+    monkeypatch.setattr(machine, "GROUPS", tmp_path / "groups")
+    monkeypatch.setattr(machine, "MOUNT", tmp_path / "mount")
     return tmp_path / "mount"
 
 
-def enter(mount: Path, groups: str) -> None:
-    write(mount.parent / "groups", groups)
+def enter(mount, groups):
+    put(mount.parent / "groups", groups)
 
 
 V1 = "cpu,cpuacct"
@@ -91,7 +87,7 @@ def test_quotas_of_control_groups(mount, case):
     """The groups above limit a process, too."""
     groups, files, expected = QUOTAS[case]
     for name, text in files.items():
-        write(mount / name, text)
+        put(mount / name, text)
     assert cgroup_quotas() == []
     enter(mount, groups)
     assert sorted(cgroup_quotas()) == expected
@@ -99,38 +95,38 @@ def test_quotas_of_control_groups(mount, case):
 
 def test_memory_left_in_control_groups(mount, monkeypatch):
     """A job of Slurm or systemd is in a group within groups. Each of them may have a limit."""
-    monkeypatch.setattr(machine, "_free_memory", lambda: 9e9)
-    monkeypatch.setattr(machine, "_left_in_address_space", lambda: 8e9)
+    monkeypatch.setattr(machine, "free_memory", lambda: 9e9)
+    monkeypatch.setattr(machine, "left_in_address_space", lambda: 8e9)
     assert available_memory() == 8e9
     enter(mount, "0::/jobs/ours\n")
-    write(mount / "jobs/ours/memory.max", "max\n")
-    write(mount / "jobs/ours/memory.current", "100\n")
+    put(mount / "jobs/ours/memory.max", "max\n")
+    put(mount / "jobs/ours/memory.current", "100\n")
     assert available_memory() == 8e9
-    write(mount / "jobs/memory.max", "5000\n")
-    write(mount / "jobs/memory.current", "3000\n")
-    write(mount / "jobs/memory.stat", "anon 2500\ninactive_file 500\n")
+    put(mount / "jobs/memory.max", "5000\n")
+    put(mount / "jobs/memory.current", "3000\n")
+    put(mount / "jobs/memory.stat", "anon 2500\ninactive_file 500\n")
     assert available_memory() == 5000 - 3000 + 500
 
 
 def test_memory_left_in_control_groups_of_version_1(mount, monkeypatch):
-    monkeypatch.setattr(machine, "_free_memory", lambda: 8e9)
-    monkeypatch.setattr(machine, "_left_in_address_space", lambda: 9e9)
+    monkeypatch.setattr(machine, "free_memory", lambda: 8e9)
+    monkeypatch.setattr(machine, "left_in_address_space", lambda: 9e9)
     enter(mount, "12:cpu:/cpu\n4:memory:/box/ours\n0::/\n")
     for group, limit in (
         ("", 9223372036854771712),
         ("box", 5000),
         ("box/ours", 9223372036854771712),
     ):
-        write(mount / "memory" / group / "memory.limit_in_bytes", f"{limit}\n")
-        write(mount / "memory" / group / "memory.usage_in_bytes", "3000\n")
-    write(mount / "memory/box/memory.stat", "inactive_file 7\ntotal_inactive_file 500\n")
+        put(mount / "memory" / group / "memory.limit_in_bytes", f"{limit}\n")
+        put(mount / "memory" / group / "memory.usage_in_bytes", "3000\n")
+    put(mount / "memory/box/memory.stat", "inactive_file 7\ntotal_inactive_file 500\n")
     assert available_memory() == 5000 - 3000 + 500
     enter(mount, "12:cpu:/cpu\n4:memory:/\n0::/\n")
     assert available_memory() == 8e9
 
 
 @pytest.mark.parametrize(
-    ("cores", "affinity", "quotas", "expected"),
+    "cores, affinity, quotas, expected",
     [(8, 8, [], 8), (8, 3, [], 3), (8, 8, [2.5, 4], 2), (8, 8, [0.5], 1), (None, 1, [], 1)],
 )
 def test_available_cores(cores, affinity, quotas, expected, monkeypatch):
@@ -140,7 +136,7 @@ def test_available_cores(cores, affinity, quotas, expected, monkeypatch):
     assert machine.count_available_cores() == expected
 
 
-@pytest.mark.parametrize(("threads", "cores", "expected"), [(8, 2, 2), (1, 4, 1), (2, 2, 2)])
+@pytest.mark.parametrize("threads, cores, expected", [(8, 2, 2), (1, 4, 1), (2, 2, 2)])
 def test_threads_are_only_ever_lowered(threads, cores, expected, monkeypatch):
     now = [threads]
     monkeypatch.setattr(torch, "get_num_threads", lambda: now[0])
@@ -151,7 +147,7 @@ def test_threads_are_only_ever_lowered(threads, cores, expected, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("module", "extra", "named"),
+    "module, extra, named",
     [
         ("embreex.rtcore_scene", "render", "embreex and scikit-image"),
         ("fast_simplification", "mesh", "fast-simplification"),

@@ -9,14 +9,13 @@ import errno
 import os
 import sys
 import types
-from collections.abc import Callable
 from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from kills import content, killed_at, missing_syncs, record_calls
+from kills import content, killed_at_every_step, missing_syncs, record_calls
 from splinecli.errors import OutputError
 from splinecli.system import files
 from splinecli.system.files import UNFINISHED, parse_json, write_bytes, write_text
@@ -36,13 +35,13 @@ NEW = {REPORT: b"new", "a.txt": b"new a", "only new.txt": b"new", "pictures/2.pn
 MINE = {"notes.txt": b"mine"}
 
 
-def write(folder: Path, contents: dict[str, bytes]) -> None:
+def write(folder, contents):
     for name, value in contents.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(value)
 
 
-def publish(folder: Path, contents: dict[str, bytes] = NEW) -> None:
+def publish(folder, contents=NEW):
     with held_folder(folder), new_files(folder, report=REPORT, stale=OLD) as new:
         for name, value in contents.items():
             new.write(name, value)
@@ -53,14 +52,9 @@ FULL = OSError(errno.ENOSPC, "No space left on device")
 
 @pytest.mark.parametrize("first", [True, False])
 def test_a_folder_with_a_report_is_whole_after_a_kill_at_any_step(tmp_path, first):
-    reports, step = [], 0
-    while True:
-        folder = tmp_path / str(step)
-        old = MINE if first else OLD | MINE
-        write(folder, old)
-        if not killed_at(step, lambda folder=folder: publish(folder)):
-            break
-        found: list[str] = []
+    reports, old = [], MINE if first else OLD | MINE
+    for folder in killed_at_every_step(tmp_path, lambda folder: write(folder, old), publish):
+        found = []
         left = content(folder)
         with held_folder(folder, found.append):
             pass
@@ -68,12 +62,11 @@ def test_a_folder_with_a_report_is_whole_after_a_kill_at_any_step(tmp_path, firs
         assert (found == [f"{folder}: {UNDONE}"]) == any(name.endswith(UNFINISHED) for name in left)
         reports.append(after.get(REPORT))
         if REPORT in after:
-            assert after in (old, NEW | MINE), step
+            assert after in (old, NEW | MINE)
         else:  # files of one run only
             assert after.items() <= (OLD | MINE).items() or after.items() <= (NEW | MINE).items()
         publish(folder)
         assert content(folder) == NEW | MINE
-        step += 1
     # The earlier report, then none, then the new one, whose place in the folder is all that is left
     # to sync.
     assert reports == sorted(
@@ -129,7 +122,7 @@ def test_a_folder_in_the_place_of_a_file(tmp_path):
     assert content(tmp_path) == {"pictures": b""}
 
 
-LINKS: dict[str, Callable[[Path, Path], None]] = {
+LINKS = {
     "link": lambda path, target: path.symlink_to(target),
     "dangling link": lambda path, target: path.symlink_to(target.with_name("new")),
     "loop": lambda path, _: path.symlink_to(path),
@@ -185,7 +178,7 @@ def test_what_a_killed_process_was_writing_goes(tmp_path):
     write(tmp_path, {"elsewhere": b"mine"})
     link = folder / f".link{UNFINISHED}"
     link.symlink_to(tmp_path / "elsewhere")
-    found: list[str] = []
+    found = []
     with held_folder(folder, found.append):
         assert content(folder) == {LOCK: b"", **mine, link.name: b"mine"}
     assert found == [f"{folder}: {UNDONE}"]
@@ -203,7 +196,7 @@ def test_everything_is_on_the_disk_before_an_earlier_file_goes(tmp_path):
 
 
 def test_the_names_of_new_folders_are_on_the_disk(tmp_path, monkeypatch):
-    synced: list[Path] = []
+    synced = []
     monkeypatch.setattr("splinecli.system.files.sync", synced.append)
     files.write_bytes(tmp_path / "a" / "b" / "c.txt", b"")
     assert {tmp_path, tmp_path / "a", tmp_path / "a" / "b"} <= set(synced)
@@ -213,12 +206,12 @@ def test_the_names_of_new_folders_are_on_the_disk(tmp_path, monkeypatch):
 
 
 @pytest.fixture(params=["posix", "windows"])
-def system(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+def system(request, monkeypatch):
     """The locks of this system, or those of Windows as its documentation describes them."""
     fcntl = pytest.importorskip("fcntl", reason="this system has no such locks")
     if request.param == "windows":
 
-        def locking(handle: int, mode: int, count: int) -> None:
+        def locking(handle, mode, count):
             assert (mode, count) == (2, 1)
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -266,7 +259,7 @@ def test_one_at_a_time_also_while_the_lock_file_is_removed(tmp_path):
 def test_files_that_a_process_has_locked_are_not_left_ones(tmp_path):
     running, left = (tmp_path / f".{name}.splinecli-unfinished" for name in ("running", "left"))
     left.touch()
-    warnings: list[str] = []
+    warnings = []
     with locked_file(running):
         with held_folder(tmp_path, warnings.append):
             assert running.exists() and not left.exists()
@@ -290,7 +283,7 @@ def test_the_lock_file_of_another_user(tmp_path, monkeypatch):
     assert (tmp_path / LOCK).exists()
 
 
-def names_in(folder: Path) -> list[str]:
+def names_in(folder):
     return [path.name for path in folder.iterdir()]
 
 

@@ -3,7 +3,6 @@
 import ctypes
 import threading
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -13,7 +12,7 @@ from splinecli.system.machine import one_thread_each, side_by_side
 
 
 @pytest.fixture(params=[1, 3], autouse=True)
-def threads(request: pytest.FixtureRequest) -> Iterator[int]:
+def threads(request):
     before = torch.get_num_threads()
     torch.set_num_threads(request.param)
     yield request.param
@@ -34,7 +33,7 @@ def test_results_come_in_order_and_parts_run_at_the_same_time(threads):
 
 
 def test_few_results_wait(threads):
-    begun: list[int] = []
+    begun = []
     for done, _ in enumerate(side_by_side(begun.append, range(100)), 1):
         assert len(begun) <= done + threads
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 # a server has to answer as a scheduler
-_CONNECT_SECONDS, _ANSWER_SECONDS, _CLOSE_SECONDS = (5.0, 6.0, 5.0)
+CONNECT_SECONDS, ANSWER_SECONDS, CLOSE_SECONDS = (5.0, 6.0, 5.0)
 _LOOK_SECONDS = 0.5  # between two updates of the list of workers
 # item per worker: the working folder and PyTorch's threads are shared by the whole process
 _ONE_AT_A_TIME = Lock()
@@ -67,7 +67,7 @@ def connected(options: ClusterOptions) -> Iterator[Client]:
         yield client
     finally:
         with suppress(OSError, TimeoutError):
-            client.close(timeout=_CLOSE_SECONDS)
+            client.close(timeout=CLOSE_SECONDS)
 
 
 def _client(address: str) -> Client:
@@ -75,8 +75,8 @@ def _client(address: str) -> Client:
     from distributed import Client, rpc
 
     async def identify() -> Any:
-        async with rpc(address, timeout=_CONNECT_SECONDS) as server:
-            return await asyncio.wait_for(server.identity(), _ANSWER_SECONDS)
+        async with rpc(address, timeout=CONNECT_SECONDS) as server:
+            return await asyncio.wait_for(server.identity(), ANSWER_SECONDS)
 
     # A client waits forever for a server that is not a scheduler, and a client that fails to start
     # can block Dask's event loop when Python deletes it. We therefore identify the server first.
@@ -86,7 +86,7 @@ def _client(address: str) -> Client:
             identity = thread.submit(asyncio.run, identify()).result()
         if identity["type"] != "Scheduler":
             raise ValueError(f"a {identity['type']} answers at {address}")
-        return Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
+        return Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except Exception as error:
         raise UsageError(
             f"no Dask scheduler answers at {address}",
@@ -152,7 +152,7 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
         try:
             yield cluster
         finally:
-            cluster.close(timeout=_CLOSE_SECONDS)
+            cluster.close(timeout=CLOSE_SECONDS)
 
 
 def _address(text: str) -> str:

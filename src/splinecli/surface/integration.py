@@ -28,9 +28,9 @@ from splinecli.surface.bilateral_equations import (
 from splinecli.system.progress import Progress, ignore
 
 _LATER_PRECISION = 0.03  # relative residual of the linear solves but the first
-_STILL = 0.002  # pixels: the rms movement at which the surface is finished
-_COARSEST = 8_000  # pixels; larger maps start from blocks of 2 x 2 pixels
-_SOLVES_OF_COARSEST = 150
+STILL = 0.002  # pixels: the rms movement at which the surface is finished
+COARSEST = 8_000  # pixels; larger maps start from blocks of 2 x 2 pixels
+SOLVES_OF_COARSEST = 150
 # of a prior in pixels or millimetres; above it, float32 only represents whole numbers
 _LARGEST_VALUE = 1e7
 RELIEF_WIDTH = 64.0  # pixels: the wavelength at which the high-pass filter halves the amplitude
@@ -151,9 +151,9 @@ def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> F
     heights = np.zeros(n_pixels)
     # At heights of zero all weights are equal, so the first solve is least squares and needs full
     # precision. Each later solve moves the surface a little further, for which few digits suffice.
-    precision, most, own_share = 1e-9, _SOLVES_OF_COARSEST if discontinuity > 0 else 1, 1.0
+    precision, most, own_share = 1e-9, SOLVES_OF_COARSEST if discontinuity > 0 else 1, 1.0
     is_huge = n_pixels > 8_000_000  # larger maps have the heights of their blocks, interpolated
-    if is_huge or (n_pixels > _COARSEST and discontinuity > 0):
+    if is_huge or (n_pixels > COARSEST and discontinuity > 0):
         blocks = Blocks.of_step(mask, 2)
         coarse = surface.of_blocks(blocks, keep_edges=not is_huge)
         of_blocks, own_share = np.zeros(blocks.mask.shape), 0.75
@@ -176,7 +176,7 @@ def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> F
         )
         heights += change
         progress(own_share / most)
-        if precision == _LATER_PRECISION and np.std(change) < _STILL:
+        if precision == _LATER_PRECISION and np.std(change) < STILL:
             break
         precision = _LATER_PRECISION
     return heights

@@ -56,8 +56,8 @@ def import_extra(
 
 LARGEST_IMAGE = 400_000_000  # pixels of the largest image that is read
 # Lines "0::/group" (version 2) or "N:controllers:/group" (version 1)
-_GROUPS = Path("/proc/self/cgroup")
-_MOUNT = Path("/sys/fs/cgroup")
+GROUPS = Path("/proc/self/cgroup")
+MOUNT = Path("/sys/fs/cgroup")
 _GROUP_FILES = (  # the limit, the use, and the file cache within it
     ("memory.max", "memory.current", "inactive_file"),  # version 2
     ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),  # version 1
@@ -72,7 +72,7 @@ def available_memory() -> float:
     the limit on its address space (ulimit -v).
     """
     in_groups = map(_left_in_group, own_groups("memory"))
-    return min(_free_memory(), _left_in_address_space(), *in_groups)
+    return min(free_memory(), left_in_address_space(), *in_groups)
 
 
 def own_groups(controller: str) -> Iterator[Path]:
@@ -80,16 +80,16 @@ def own_groups(controller: str) -> Iterator[Path]:
     and of those above.
     """
     try:
-        lines = _GROUPS.read_text("utf-8").splitlines()
+        lines = GROUPS.read_text("utf-8").splitlines()
     except OSError:
         return  # not Linux
     for line in lines:
         _, controllers, group = line.split(":", 2)
         if controllers and controller not in controllers.split(","):
             continue
-        top = _MOUNT / controllers
+        top = MOUNT / controllers
         if not top.is_dir():
-            top = _MOUNT / controller
+            top = MOUNT / controller
         folder = top / group.lstrip("/")
         # Inside a container the path may be the host's, which does not exist here. The top always
         # exists.
@@ -145,7 +145,7 @@ def _of_c_library(name: str) -> Callable[..., object]:
     return found
 
 
-def _free_memory() -> float:
+def free_memory() -> float:
     return 1024 * _value_after("MemAvailable:", Path("/proc/meminfo"), math.inf)
 
 
@@ -173,7 +173,7 @@ def _address_space_limit() -> float:
     return math.inf if most == resource.RLIM_INFINITY else most
 
 
-def _left_in_address_space() -> float:
+def left_in_address_space() -> float:
     return _address_space_limit() - 1024 * _value_after("VmSize:", Path("/proc/self/status"), 0)
 
 

@@ -4,14 +4,12 @@ import os
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from scenes import Floats, directions_at, shade, sphere
+from scenes import directions_at, shade, sphere
 from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.film import (
     FEWEST_FRAMES,
@@ -27,12 +25,12 @@ from splinecli.pictures.maps import encode_png
 SIZE = 96
 
 
-def encode_bt709(linear: Floats) -> Floats:
+def encode_bt709(linear):
     """The curve of ITU-R BT.709, from its text."""
     return np.where(linear < 0.018, 4.5 * linear, 1.099 * np.maximum(linear, 1e-9) ** 0.45 - 0.099)
 
 
-def sphere_film(lights: Floats, texture: float = 0.3) -> NDArray[np.uint8]:
+def sphere_film(lights, texture=0.3):
     """Frames (F, SIZE, SIZE) of a matte sphere with fine texture, under lights (F, 3),
     with noise.
     """
@@ -44,7 +42,7 @@ def sphere_film(lights: Floats, texture: float = 0.3) -> NDArray[np.uint8]:
     return np.rint(255 * encode_bt709(linear.clip(0, 1))).astype(np.uint8)
 
 
-def write_film(path: Path, frames: NDArray[np.uint8], codec: str = "MJPG") -> Path:
+def write_film(path, frames, codec="MJPG"):
     video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 25, frames.shape[:0:-1])  # type: ignore[attr-defined]
     assert video.isOpened()
     for frame in frames:
@@ -53,12 +51,12 @@ def write_film(path: Path, frames: NDArray[np.uint8], codec: str = "MJPG") -> Pa
     return path
 
 
-def path_of_lamp(count: int) -> Floats:
+def path_of_lamp(count):
     """Lights (count, 3) along a slow spiral, as a lamp is carried."""
     return directions_at(np.linspace(0, 6 * np.pi, count), np.radians(np.linspace(15, 50, count)))
 
 
-@pytest.mark.parametrize(("name", "codec"), [("clip.avi", "MJPG"), ("clip.mp4", "mp4v")])
+@pytest.mark.parametrize("name, codec", [("clip.avi", "MJPG"), ("clip.mp4", "mp4v")])
 def test_frames_under_different_lights_are_chosen(tmp_path, name, codec):
     lights, frames = path_of_lamp(150), sphere_film(path_of_lamp(150))
     film = write_film(tmp_path / name, frames, codec)
@@ -88,7 +86,7 @@ def test_the_curve_is_undone():
     np.testing.assert_allclose(decode_transfer(stored, BT709), linear, atol=2e-4)
 
 
-@pytest.mark.parametrize(("number", "curve"), [(1, BT709), (8, 1.0), (13, None)])
+@pytest.mark.parametrize("number, curve", [(1, BT709), (8, 1.0), (13, None)])
 def test_code_points_go_before_other_curves(tmp_path, number, curve):
     """cICP, ITU-T H.273: BT.709, linear and sRGB. 16 and 18 are those of films with a high dynamic
     range.

@@ -2,16 +2,13 @@
 
 import struct
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.io
 import tifffile
 from numpy.testing import assert_allclose, assert_array_equal
-from numpy.typing import NDArray
 
-from scenes import Floats
 from splinecli.capture import read_normal_map
 from splinecli.capture.formats.normal_files import read_ground_truth
 from splinecli.capture.formats.numbers import read_mat
@@ -24,7 +21,7 @@ MASK[0] = False
 
 
 @pytest.fixture
-def normals() -> Floats:
+def normals():
     """(4, 5, 3) unit normals, zero at [1, 2] and outside the mask."""
     field = (
         unit(np.random.default_rng(3).normal(size=(*SHAPE, 3)) * [1, 1, 0.2] + [0, 0, 1])
@@ -34,11 +31,11 @@ def normals() -> Floats:
     return np.asarray(field)
 
 
-def read_normals(path: Path, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+def read_normals(path, mask):
     return read_ground_truth(path, mask)[0]
 
 
-def write(path: Path, normals: Floats) -> Path:
+def write(path, normals):
     match path.suffix:
         case ".mat":
             scipy.io.savemat(path, {"Normal_gt": normals})
@@ -61,7 +58,7 @@ def test_floating_point_sources(tmp_path, normals, name, length):
 
 @pytest.mark.parametrize("name", ["a.png", "a.tif", "a.npy", "a.mat"])
 # half a step of each channel
-@pytest.mark.parametrize(("bits", "error_deg"), [(16, 0.002), (8, 0.5)])
+@pytest.mark.parametrize("bits, error_deg", [(16, 0.002), (8, 0.5)])
 def test_pictures(write_image, tmp_path, normals, name, bits, error_deg):
     has_normal = normals.any(axis=2)
     picture = encode_picture(normals, has_normal, bits=bits)
@@ -209,10 +206,10 @@ def test_matlab_s_byte_orders_and_undefined_types(tmp_path, compressed):
             read_normals(path, MASK)
 
 
-def write_mat(path: Path, values: Floats, order: str, *, kind: int, compressed: bool) -> Path:
+def write_mat(path, values, order, *, kind, compressed):
     """Write the variable N by the description of the format, its numbers with a type."""
 
-    def element(kind: int, content: bytes) -> bytes:
+    def element(kind, content):
         return struct.pack(order + "II", kind, len(content)) + content + b"\0" * (-len(content) % 8)
 
     sizes = struct.pack(order + "3i", *values.shape)

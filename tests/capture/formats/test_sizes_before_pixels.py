@@ -8,7 +8,6 @@ import resource
 import struct
 import sys
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -40,7 +39,7 @@ MOST_GROWTH = 300 * 2**20
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="measures memory as Linux does")
 
 
-def write_claim(path: Path, height: int, width: int) -> None:
+def write_claim(path, height, width):
     """A PNG that states a size and has no pixels. Whoever decodes it finds it damaged."""
     write_image(path, np.zeros(SMALL, np.uint8))
     content = path.read_bytes()
@@ -48,14 +47,14 @@ def write_claim(path: Path, height: int, width: int) -> None:
     path.write_bytes(content[:8] + png_chunk(b"IHDR", header) + png_chunk(b"IEND", b""))
 
 
-def write_jpeg(path: Path) -> None:
+def write_jpeg(path):
     content = bytearray(cv2.imencode(".jpg", np.zeros(SMALL, np.uint8))[1].tobytes())
     frame = content.index(b"\xff\xc0")
     content[frame + 5 : frame + 9] = struct.pack(">HH", HUGE, HUGE)
     path.write_bytes(content)
 
 
-def write_tiff(path: Path, height: int, width: int, data: bytes, *, tile: int = 0) -> None:
+def write_tiff(path, height, width, data, *, tile=0):
     """A TIFF whose only strip, or tile, is these compressed bytes."""
     layout = (
         [(322, tile), (323, tile), (324, 0), (325, len(data))]
@@ -70,7 +69,7 @@ def write_tiff(path: Path, height: int, width: int, data: bytes, *, tile: int = 
     path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4) + data)
 
 
-def write_mat(path: Path, shape: tuple[int, int, int], n_zeros: int) -> None:
+def write_mat(path, shape, n_zeros):
     """A compressed .mat file whose array claims a shape and expands to a number of zeros."""
     buffer = io.BytesIO()
     savemat(buffer, {"Normal_gt": np.zeros((2, 2, 3))})
@@ -89,7 +88,7 @@ def write_mat(path: Path, shape: tuple[int, int, int], n_zeros: int) -> None:
     path.write_bytes(header + struct.pack("<II", 15, len(packed)) + packed)
 
 
-def growth(work: Callable[[], object]) -> int:
+def growth(work):
     """Bytes by which the largest memory of a process grows while it does the work."""
     reader, writer = os.pipe()
     if os.fork() == 0:
@@ -103,10 +102,10 @@ def growth(work: Callable[[], object]) -> int:
     return int(os.read(reader, 100))
 
 
-def refused(work: Callable[[], object], match: str) -> None:
+def refused(work, match):
     """Check that the work raises InputError, and that this takes little memory."""
 
-    def check() -> None:
+    def check():
         with pytest.raises(InputError, match=match):
             work()
 
@@ -114,7 +113,7 @@ def refused(work: Callable[[], object], match: str) -> None:
     assert growth(check) < MOST_GROWTH
 
 
-def ground_truth(path: Path) -> object:
+def ground_truth(path):
     return read_ground_truth(path, np.ones(SMALL, np.bool_))
 
 

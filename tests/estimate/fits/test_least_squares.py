@@ -2,20 +2,16 @@
 halves of the lights.
 """
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose
-from numpy.typing import NDArray
 from scipy.optimize import linprog
-from torch import Tensor
 from torch.nn.functional import normalize, pad
 from torch.testing import assert_close
 
 from distributions import seeded
-from scenes import Floats, cap_directions, directions_at, ring_lights, spiral_lights
+from scenes import cap_directions, directions_at, ring_lights, spiral_lights
 from splinecli.estimate.fits.least_squares import (
     RIDGE,
     SMALLEST_VARIANCE,
@@ -34,7 +30,7 @@ from splinecli.maths.robust import inverse_3x3, multiply_symmetric
 ROBUST = ("iw12", "l1", "ls-trimmed")
 
 
-def estimate(name: str, observations: NDArray[np.floating], lights: Floats) -> NDArray[np.floating]:
+def estimate(name, observations, lights):
     return make_estimator(name, MethodOptions(device="cpu")).estimate(
         observations.astype(np.float32), lights
     )
@@ -83,8 +79,7 @@ def test_iw12_fixed_point(matte_pixels):
 
 def test_l1_is_the_linear_programme_s_optimum():
     rng = np.random.default_rng(0)
-    lights = rng.normal(size=(10, 3)) * (0.4, 0.4, 0.1) + (0, 0, 1)
-    lights = unit(lights)
+    lights = unit(rng.normal(size=(10, 3)) * (0.4, 0.4, 0.1) + (0, 0, 1))
     observations = rng.uniform(size=(30, 10))
     found = solve_l1(torch.tensor(observations), torch.tensor(lights)).numpy()
     excess = []
@@ -99,7 +94,7 @@ def test_l1_is_the_linear_programme_s_optimum():
     assert max(excess) < 4e-3
 
 
-@pytest.mark.parametrize(("count", "dropped"), [(3, 0), (4, 0), (5, 0), (6, 1), (10, 2), (96, 19)])
+@pytest.mark.parametrize("count, dropped", [(3, 0), (4, 0), (5, 0), (6, 1), (10, 2), (96, 19)])
 def test_trimmed_ends(count, dropped):
     """Moving a trimmed observation further out changes nothing; moving the next one does."""
     rng = np.random.default_rng(0)
@@ -145,21 +140,21 @@ def test_weighted_step_against_lapack():
         assert_allclose(covariance[:, i], entries, rtol=1e-5, atol=1e-9 * np.trace(inverse))
 
 
-def normals_under(limit_deg: float, count: int) -> Tensor:
+def normals_under(limit_deg, count):
     return torch.tensor(cap_directions(count, limit_deg), dtype=torch.float32)
 
 
-def ring(count: int, zenith_deg: float) -> Tensor:
+def ring(count, zenith_deg):
     return torch.tensor(ring_lights(count, zenith_deg, 0.1), dtype=torch.float32)
 
 
-def error_deg(scaled_normals: Tensor, truth: Tensor) -> np.ndarray:
+def error_deg(scaled_normals, truth):
     return angle_between_deg(
         torch.nn.functional.normalize(scaled_normals, dim=1).numpy(), truth.numpy()
     )
 
 
-def to_unit_scale(observations: Tensor) -> Tensor:
+def to_unit_scale(observations):
     return observations / observations.amax(dim=1, keepdim=True)
 
 
@@ -199,13 +194,13 @@ ROWS, COLUMNS = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
 """Places of xx, yy, zz, xy, xz, yz in a matrix."""
 
 
-def positive_matrices(count: int, rank: int = 3) -> Floats:
+def positive_matrices(count, rank=3):
     factors = np.random.default_rng(0).normal(size=(count, 3, rank))
     return np.asarray(factors @ factors.transpose(0, 2, 1))
 
 
-def inverse(matrices: NDArray[Any], smallest: float, library: str) -> NDArray[Any]:
-    entries: list[Any] = [matrices[:, i, j] for i, j in zip(ROWS, COLUMNS, strict=True)]
+def inverse(matrices, smallest, library):
+    entries = [matrices[:, i, j] for i, j in zip(ROWS, COLUMNS, strict=True)]
     if library == "torch":
         entries = [torch.from_numpy(entry) for entry in entries]
     result = np.empty_like(matrices)
@@ -214,13 +209,12 @@ def inverse(matrices: NDArray[Any], smallest: float, library: str) -> NDArray[An
     return result
 
 
-@pytest.mark.parametrize("library", ["numpy", "torch"])
-def test_inverse(library):
+def test_inverse():
     matrices = positive_matrices(1000)
     expected = np.linalg.inv(matrices)
     size = np.abs(expected).max(axis=(1, 2), keepdims=True)
     # The worst of a thousand such matrices has a condition number of about 1e7.
-    assert_allclose(inverse(matrices, 1e-14, library) / size, expected / size, atol=1e-8)
+    assert_allclose(inverse(matrices, 1e-14, "numpy") / size, expected / size, atol=1e-8)
 
 
 def test_numpy_and_torch_agree_to_the_last_bit():
@@ -252,7 +246,7 @@ LIGHTS = torch.tensor(spiral_lights(10, 55))
 SIGNS = alternating_signs(LIGHTS)
 
 
-def noisy_pixels(lights: Tensor, noise: float) -> tuple[Tensor, Tensor]:
+def noisy_pixels(lights, noise):
     """Normals (2000, 3) of matte pixels that no light leaves dark, and their observations (2000,
     F).
     """

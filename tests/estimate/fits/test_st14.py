@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import quadprog
 import torch
-from numpy.typing import NDArray
 
 from scenes import Floats, cap_directions, halfway
 from splinecli.estimate.fits.ia14 import fit_ia14
@@ -20,13 +19,13 @@ from splinecli.maths.normals import angle_between_deg
 Array = Floats
 
 
-def half_cosines(normals: Array, lights: Array) -> tuple[Array, Array]:
+def half_cosines(normals, lights):
     """n.h (P, F) and l.h (F,)."""
     bisectors = halfway(lights)
     return normals @ bisectors.T, (lights * bisectors).sum(axis=1)
 
 
-def bipolynomial(normals: Array, lights: Array) -> Array:
+def bipolynomial(normals, lights):
     """Observations (P, F) under nine random coefficients a pixel,
     as the model's definition has it.
     """
@@ -34,7 +33,7 @@ def bipolynomial(normals: Array, lights: Array) -> Array:
     coefficients = np.random.default_rng(5).uniform(-0.3, 0.3, (len(normals), 3, 3))
     coefficients[:, 0, 0] = 1
     powers = np.arange(3)
-    reflectance: Array = np.einsum(
+    reflectance = np.einsum(
         "pab,pfa,fb->pf",
         coefficients,
         (1 - half[..., None]) ** powers,
@@ -43,14 +42,14 @@ def bipolynomial(normals: Array, lights: Array) -> Array:
     return reflectance * (normals @ lights.T)
 
 
-def estimate(observations: Array, lights: Array) -> Array:
+def estimate(observations, lights):
     estimator = make_estimator("st14", MethodOptions(device="cpu"))
     return estimator.estimate(observations.astype(np.float32), lights).astype(np.float64)
 
 
-def solved(observations: Array, lights: Array) -> Array:
+def solved(observations, lights):
     scaled = observations / observations.max(axis=1, keepdims=True)
-    normals: Array = solve_st14(torch.from_numpy(scaled), torch.from_numpy(lights)).numpy()
+    normals = solve_st14(torch.from_numpy(scaled), torch.from_numpy(lights)).numpy()
     return normals
 
 
@@ -60,7 +59,7 @@ LIGHTS = cap_directions(96, 38, 1, even=True)
 OBSERVATIONS = bipolynomial(TRUTH, LIGHTS)
 
 
-def with_highlights(observations: Array, untouched: int) -> Array:
+def with_highlights(observations, untouched):
     """All but the lowest of a pixel's observations up to six times as bright."""
     rank = observations.argsort(axis=1).argsort(axis=1)
     gain = np.random.default_rng(7).uniform(0, 5, observations.shape)
@@ -81,7 +80,7 @@ def test_highlights_in_the_brightest_observations_change_nothing():
     assert angle_between_deg(estimate(bright, LIGHTS), TRUTH).max() < 0.1
 
 
-@pytest.mark.parametrize(("count", "cast"), [(4, 0.0), (6, 0.0), (10, 0.0), (64, 0.1)])
+@pytest.mark.parametrize("count, cast", [(4, 0.0), (6, 0.0), (10, 0.0), (64, 0.1)])
 def test_exact_on_lambertian_scenes_with_shadows(count, cast):
     lights, truth = cap_directions(count, 70, 3, even=True), cap_directions(300, 60, 4, even=True)
     observations = np.maximum(truth @ lights.T, 0)
@@ -93,7 +92,7 @@ def test_exact_on_lambertian_scenes_with_shadows(count, cast):
     assert angle_between_deg(estimate(observations, lights), truth)[reached].max() < 0.001
 
 
-@pytest.mark.parametrize(("count", "untouched"), [(10, 8), (96, 60)])
+@pytest.mark.parametrize("count, untouched", [(10, 8), (96, 60)])
 def test_noise_and_highlights_cost_less_than_in_least_squares(count, untouched):
     lights = cap_directions(count, 38, 3, even=True)
     noise = np.random.default_rng(6).normal(1, 0.01, (len(TRUTH), count))
@@ -109,22 +108,20 @@ Array = Floats
 ON_CPU = MethodOptions(device="cpu")
 
 
-def bernstein(x: Array, degree: int) -> Array:
+def bernstein(x, degree):
     return np.stack(
         [comb(degree, i) * x**i * (1 - x) ** (degree - i) for i in range(degree + 1)], axis=-1
     )
 
 
-def rendered(normals: Array, lights: Array, seed: int) -> Array:
+def rendered(normals, lights, seed):
     """Diffuse and a Blinn-Phong highlight of random strength and width, with attached shadows;
     largest 1.
     """
     rng = np.random.default_rng(seed)
     strength, exponent = rng.uniform(0, 2, (len(normals), 1)), rng.uniform(5, 80, (len(normals), 1))
     shading = (normals @ lights.T).clip(0)
-    observations: Array = shading * (
-        1 + strength * (normals @ halfway(lights).T).clip(0) ** exponent
-    )
+    observations = shading * (1 + strength * (normals @ halfway(lights).T).clip(0) ** exponent)
     return observations / observations.max(axis=1, keepdims=True)
 
 
@@ -143,9 +140,7 @@ def test_lambertian_is_exact():
         assert angle_between_deg(found, truth).max() < 0.02
 
 
-def objective_of(
-    intensities: Array, lights: Array, prior_weight: float
-) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+def objective_of(intensities, lights, prior_weight):
     """The whole programme of one pixel, over x = (n, c_10 .. c_24): no variable eliminated, no
     increments.
 

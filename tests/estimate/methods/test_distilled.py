@@ -2,14 +2,12 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
-from torch import Tensor
 
 from distributions import seeded
 from scenes import Teacher, cap_directions, shade, spiral_lights
@@ -22,7 +20,7 @@ from splinecli.estimate.methods.estimator import (
     confident_share,
     student_sizes,
 )
-from splinecli.lights.lighting import LightingAt, PixelLighting
+from splinecli.lights.lighting import PixelLighting
 from splinecli.maths.normals import angle_between_deg, unit
 
 Floats = NDArray[np.floating]
@@ -40,12 +38,10 @@ class Remembering(Teacher):
     errors: Floats
     places: dict[bytes, int] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         self.places = {row.tobytes(): place for place, row in enumerate(self.observations)}
 
-    def estimate_with_error(
-        self, observations: Any, light_directions: Any, *, progress: Any = None
-    ) -> tuple[Floats, Floats]:
+    def estimate_with_error(self, observations, light_directions, *, progress=None):
         assert light_directions.shape in (LIGHTS.shape, (len(observations), *LIGHTS.shape))
         self.asked += len(observations)
         if progress is not None:
@@ -54,11 +50,11 @@ class Remembering(Teacher):
         return self.normals[places], self.errors[places]
 
 
-def log_median(degrees: float) -> tuple[float, float]:
+def log_median(degrees):
     return math.log(math.radians(degrees)), math.log(2)
 
 
-def noisy(normals: Floats, degrees: float, seed: int = 5) -> Floats:
+def noisy(normals, degrees, seed=5):
     """Return normals turned by about so many degrees."""
     noise = (
         np.random.default_rng(seed).normal(size=normals.shape)
@@ -68,22 +64,22 @@ def noisy(normals: Floats, degrees: float, seed: int = 5) -> Floats:
     return unit(normals + noise - normals * (normals * noise).sum(axis=1, keepdims=True))
 
 
-def glossy(count: int = 8000) -> tuple[Floats, NDArray[np.float32]]:
+def glossy(count=8000):
     normals = cap_directions(count, 50)
     return normals, shade(normals, LIGHTS, gloss=0.8).astype(np.float32)
 
 
-def distant(observations: NDArray[np.float32]) -> LightingAt:
+def distant(observations):
     return lambda rows: PixelLighting(observations[rows], LIGHTS)
 
 
-def learn(teacher: Remembering, size: StudentSize = SIZE, **options: Any) -> DistilledEstimator:
+def learn(teacher, size=SIZE, **options):
     return distil(
         teacher, distant(teacher.observations), len(teacher.observations), size, **options
     )
 
 
-def sure(observations: NDArray[np.float32], normals: Floats, degrees: float = 2) -> Remembering:
+def sure(observations, normals, degrees=2):
     """A teacher who expects the same error everywhere."""
     return Remembering(observations, normals, np.tile(log_median(degrees), (len(normals), 1)))
 
@@ -234,7 +230,7 @@ def test_sizes_grow_with_the_capture():
         assert usual.width < larger.width
 
 
-def clusters() -> Tensor:
+def clusters():
     """Return 5,000 features near the origin, 20 far away near (9, 0, 0), and one at (0, 30, 0)."""
     generator = seeded(1)
     points = torch.randn(5021, 3, generator=generator) * 0.3

@@ -2,11 +2,8 @@
 others.
 """
 
-from typing import Any
-
 import pytest
 import torch
-from torch import Tensor
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
@@ -35,7 +32,7 @@ from tiny_networks import TINY, random_network
 HEIGHT, WIDTH = 6, 9
 
 
-def random_net(**settings: Any) -> RefineNet:
+def random_net(**settings):
     """A net whose every layer does something."""
     generator = seeded(0)
     net = RefineNet(**settings)
@@ -45,14 +42,14 @@ def random_net(**settings: Any) -> RefineNet:
     return net.eval()
 
 
-def random_maps(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+def random_maps(height, width, seed=0):
     generator = seeded(seed)
     mask = (torch.rand(1, 1, height, width, generator=generator) < 0.9).float()
     features = torch.randn(1, FEATURE_CHANNELS, height, width, generator=generator) * mask
     return features, mask
 
 
-def features_of(observations: Tensor, lights: Tensor, normals: Tensor, error: Tensor) -> Tensor:
+def features_of(observations, lights, normals, error):
     """Features (CHANNELS, H, W) of observations (F, H, W), normals (3, H, W) and error (2, H,
     W).
     """
@@ -166,14 +163,14 @@ def test_nothing_beyond_the_reach_counts(turned, twice):
 SEES = TINY | {"map_size": 16, "set_width": 16, "set_layers": 2, "error_head": True}
 
 
-def pixels(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+def pixels(count, seed=0):
     """Random observations under seven lights."""
     lights = normalize(torch.rand(7, 3, generator=seeded(seed)) + 0.2, dim=1)
     return torch.rand(count, 7, generator=seeded(seed + 1)), lights
 
 
 @pytest.fixture(scope="module")
-def network() -> SplineNet:
+def network():
     return random_network(**SEES, sees_capture=True)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy import stats
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
@@ -28,7 +28,7 @@ FLIP = torch.tensor((1.0, -1.0, 1.0))
 
 
 @pytest.fixture(scope="module")
-def pixels() -> tuple[Tensor, Tensor]:
+def pixels():
     """64 generated pixels under ten shared lights, in float64 so that no rounding moves a light to
     another cell.
     """
@@ -39,7 +39,7 @@ def pixels() -> tuple[Tensor, Tensor]:
     return scene.radiance(lights.float()).double(), normalize(lights, dim=1)  # type: ignore[attr-defined]
 
 
-def turn(vectors: Tensor, degrees: float) -> Tensor:
+def turn(vectors, degrees):
     angle = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
     return rotate_about_view_axis(vectors.double(), angle.cos(), angle.sin())
 
@@ -129,7 +129,7 @@ def test_autocast_does_not_round_the_geometry(pixels):
         assert_close(coarse, network(observations, lights).normals, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize(("median_deg", "shape"), [(0.5, 1.0), (4.0, 2.5), (30.0, 0.7)])
+@pytest.mark.parametrize("median_deg, shape", [(0.5, 1.0), (4.0, 2.5), (30.0, 0.7)])
 def test_a_log_logistic_distribution(median_deg, shape):
     error = torch.tensor(
         [[math.log(math.radians(median_deg)), math.log(shape)]], dtype=torch.float64
@@ -178,7 +178,7 @@ def test_few_products_give_the_features_of_the_convolutions(n_maps):
 NAMES = tuple(STARTING_FITS)
 
 
-def draw_pixels(count: int, lights: int) -> tuple[torch.Tensor, torch.Tensor]:
+def draw_pixels(count, lights):
     """Observations (P, F), the largest of each pixel 1, and lights (P, F, 3) of its own for each
     pixel.
     """

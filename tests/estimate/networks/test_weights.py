@@ -4,7 +4,6 @@ import hashlib
 import json
 import pickle
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -24,14 +23,12 @@ from tiny_networks import TINY, random_network
 
 
 @pytest.fixture
-def saved(tmp_path: Path) -> Path:
+def saved(tmp_path):
     save_weights(random_network(), tmp_path / "tiny.safetensors")
     return tmp_path / "tiny.safetensors"
 
 
-def write_like_splinecli(
-    path: Path, network: SplineNet, tensors: dict[str, Tensor], **changes: str
-) -> None:
+def write_like_splinecli(path, network, tensors, **changes):
     metadata = {"format": WEIGHTS_FORMAT, "config": json.dumps(network.config.to_dict())}
     save_file(tensors, path, metadata | {"tensors_sha256": tensors_sha256(tensors)} | changes)
 
@@ -91,7 +88,7 @@ class TensorsMade(TorchFunctionMode):
 
     made: tuple[int, ...] = ()
 
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_function__(self, func, types, args=(), kwargs=None):
         result = func(*args, **(kwargs or {}))
         if isinstance(result, Tensor) and not result.is_meta:
             self.made += (result.numel(),)
@@ -203,7 +200,7 @@ def test_round_trip_of_a_configuration():
 
 
 @pytest.mark.parametrize(
-    ("values", "message"),
+    "values, message",
     [
         ({"grid": "odd"}, "network setting 'grid' is 'odd'; expected 'even' or 'cnn-ps'"),
         ({"grid": "cnn-ps"}, "network setting 'grid' is 'cnn-ps'; it needs the size 'paper'"),

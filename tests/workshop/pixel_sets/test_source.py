@@ -17,7 +17,6 @@ from splinecli.workshop.pixel_sets.source import (
     SampledPixels,
     fill_gaps,
 )
-from splinecli.workshop.pixel_sets.store import PixelSet
 from splinecli.workshop.synthesis.batches import CaptureConfig
 
 FAULTLESS = CaptureConfig(
@@ -33,9 +32,7 @@ FAULTLESS = CaptureConfig(
 )
 
 
-def source_of(
-    pixel_set: PixelSet, config: CaptureConfig = FAULTLESS, seed: int = 0
-) -> PixelSetSource:
+def source_of(pixel_set, config=FAULTLESS, seed=0):
     return PixelSetSource(pixel_set, pixel_set.entries, config, seeded(seed))
 
 
@@ -122,7 +119,7 @@ def test_pixels_of_a_capture_are_of_one_entry_under_the_same_lights(make_set):
     assert shares == pytest.approx([4 / 9, 3 / 9, 2 / 9], abs=0.1)
 
 
-def analytic_scene(pixels: int = 6) -> tuple[SampledPixels, torch.Tensor]:
+def analytic_scene(pixels=6):
     """Matte pixels under lights at the centres of a third of the cells."""
     directions, inside = cell_directions()
     lights = directions[inside][::3].expand(pixels, -1, 3)

@@ -2,14 +2,13 @@
 
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from kills import content, killed_at
+from kills import content, killed_at_every_step
 from scenes import read_json
 from small_pixel_sets import matte_pixels
 from splinecli.errors import InputError, OutputError
@@ -25,7 +24,7 @@ from splinecli.workshop.pixel_sets.store import (
 RECIPE = {"scenes": {"lights": 30}, "seed": 1}
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
+def read_manifest(folder):
     return read_json(folder / MANIFEST)
 
 
@@ -85,19 +84,17 @@ def test_recipes_are_compared(tmp_path):
 
 
 def test_a_replacement_killed_at_any_step_leaves_the_old_set_or_an_unfinished_one(tmp_path):
-    old, new, kept, step = matte_pixels(7, 5), matte_pixels(9, 4), [], 0
-    while True:
-        folder = tmp_path / str(step)
-        folder.mkdir()
+    old, new, kept = matte_pixels(7, 5), matte_pixels(9, 4), []
+
+    def make(folder):
         writer = PixelSetWriter(folder)
         writer.add("a", "a", "a test", RECIPE, old)
         writer.finish()
 
-        def replace(folder=folder):
-            PixelSetWriter(folder).add("a", "a", "a test", {"seed": 2}, new)
+    def replace(folder):
+        PixelSetWriter(folder).add("a", "a", "a test", {"seed": 2}, new)
 
-        if not killed_at(step, replace):
-            break
+    for folder in killed_at_every_step(tmp_path, make, replace):
         with held_folder(folder):
             again = PixelSetWriter(folder)
         kept.append(again.recipe_of("a") if "a" in again else None)
@@ -107,15 +104,12 @@ def test_a_replacement_killed_at_any_step_leaves_the_old_set_or_an_unfinished_on
             with pytest.raises(InputError, match="not finished"):
                 open_pixel_set(folder)
             if kept[-1] is None:  # while its files changed, the set did not have the entry
-                replace()
+                replace(folder)
                 again = PixelSetWriter(folder)
             (entry,) = again.finish().entries
             assert (entry.n_pixels, entry.recipe) == (9, {"seed": 2})
             assert open_pixel_set(folder).entries == (entry,)
-        step += 1
-    assert RECIPE in kept
-    assert None in kept
-    assert {"seed": 2} in kept
+    assert all(recipe in kept for recipe in (RECIPE, None, {"seed": 2}))
 
 
 def test_a_folder_with_other_files_is_left_alone(tmp_path):
@@ -128,7 +122,7 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("manifest", "message"),
+    "manifest, message",
     [
         ({"name": "an app"}, "not the manifest of a pixel set: found format None"),
         (
@@ -169,7 +163,7 @@ def test_no_changed_byte_goes_unnoticed(make_set, array, entry):
         open_pixel_set(folder)
 
 
-DAMAGED: dict[str, Callable[[Path], object]] = {
+DAMAGED: dict[str, Any] = {
     "pipe": os.mkfifo,
     "folder": Path.mkdir,
     "link to nothing": lambda path: path.symlink_to("nothing"),
@@ -202,7 +196,7 @@ def test_a_damaged_array_is_named(make_set, array, damage):
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "message"),
+    "key, value, message",
     [
         (
             "n_pixels",
@@ -243,7 +237,7 @@ def test_a_changed_manifest(make_set, key, value, message):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text, message",
     [
         ("{", "not JSON"),
         (

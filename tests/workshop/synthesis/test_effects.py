@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 import torch
 from scipy import stats
-from torch import Tensor
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from distributions import SHARE, N, assert_uniform, seeded
-from scenes import Floats
+from distributions import SHARE, N, assert_uniform, seeded, share
 from splinecli.maths.normals import angle_between_deg
 from splinecli.maths.observation_map import cell_directions, dot
 from splinecli.maths.transfer import decode_transfer
@@ -36,7 +34,7 @@ def test_walls_have_the_stated_shapes():
     normals = draw_visible_normals(N, seeded(1))
     wall = draw_wall(normals, 0.4, seeded())
     present = wall.tan_height[:, 0] > 0
-    assert present.float().mean().item() == pytest.approx(0.4, abs=SHARE)
+    assert share(present) == pytest.approx(0.4, abs=SHARE)
     assert_uniform(torch.rad2deg(wall.tan_height[present].atan()), 8, 75)
     assert_uniform(torch.rad2deg(wall.tan_half_width.atan()), 15, 88)
     assert_uniform(wall.softness, 0.01, 0.06)
@@ -48,7 +46,7 @@ def test_walls_have_the_stated_shapes():
     assert dot(wall.facing, wall.azimuth[:1])[0, 0] < 0
     assert ((wall.facing * wall.azimuth).sum(dim=1) < 0).all()
     assert not wall.reflectance[~present].any()
-    assert wall.has_pixel_material.float().mean().item() == pytest.approx(0.5, abs=SHARE)
+    assert share(wall.has_pixel_material) == pytest.approx(0.5, abs=SHARE)
     # What reflects lies on the wall, on the side that faces the pixel.
     assert_close(wall.towards.norm(dim=1), torch.ones(N))
     along = (wall.towards * wall.azimuth).sum(dim=1)
@@ -56,7 +54,7 @@ def test_walls_have_the_stated_shapes():
     assert ((wall.facing * wall.towards).sum(dim=1) < 0).all()
 
 
-def matte(pixels: int) -> PrincipledMaterial:
+def matte(pixels):
     """White, by Lambert's law: an interface without any loss keeps Burley's retro-reflection
     away.
     """
@@ -71,7 +69,7 @@ def matte(pixels: int) -> PrincipledMaterial:
     return PrincipledMaterial(**plain | {"tail_exponent": zero + 2, "second_roughness": zero + 1})
 
 
-def mirror(pixels: int) -> PrincipledMaterial:
+def mirror(pixels):
     return replace(
         matte(pixels), metallic=torch.ones(pixels, 1), roughness=torch.full((pixels, 1), 0.2)
     )
@@ -80,8 +78,7 @@ def mirror(pixels: int) -> PrincipledMaterial:
 def test_matte_walls_reflect_by_the_cosine_law_twice():
     normals = draw_visible_normals(50, seeded(1))
     wall = replace(
-        draw_wall(normals, 1.0, seeded()),
-        has_pixel_material=torch.zeros(50, 1, dtype=torch.bool),
+        draw_wall(normals, 1.0, seeded()), has_pixel_material=torch.zeros(50, 1, dtype=torch.bool)
     )
     directions, inside = cell_directions()
     cosine = dot(wall.facing, directions[inside]).clamp(min=0)
@@ -138,14 +135,12 @@ def test_a_known_wall_hides_the_lights_behind_it():
 
 def test_ambient_light():
     ambient = draw_ambient(N, 0.3, seeded())
-    assert ambient.shape == (N, 1) and (ambient > 0).float().mean().item() == pytest.approx(
-        0.3, abs=SHARE
-    )
+    assert ambient.shape == (N, 1) and share(ambient > 0) == pytest.approx(0.3, abs=SHARE)
     assert_uniform(ambient[ambient > 0].log10(), -3.5, -1.3)
     assert not draw_ambient(N, 0.0, seeded()).any()
 
 
-def tilted_lights(pixels: int, lights: int) -> Tensor:
+def tilted_lights(pixels, lights):
     directions = torch.randn(pixels, lights, 3, generator=seeded(3))
     directions[..., 2] = directions[..., 2].abs() + 0.5
     return normalize(directions, dim=-1)
@@ -184,11 +179,11 @@ def test_exposure():
     radiance = torch.rand(N, 5, generator=seeded(3)) * 30
     brightest = (radiance * draw_exposure(radiance, 0.25, seeded())).amax(dim=1)
     over = brightest > 1
-    assert over.float().mean().item() == pytest.approx(0.25, abs=SHARE)
+    assert share(over) == pytest.approx(0.25, abs=SHARE)
     assert_uniform(brightest[over], 1, 3)
     dark = brightest < 10**-1.3
     # U(-2.7, -0.7) for 40 %: seven tenths of it lie below -1.3.
-    assert dark[~over].float().mean().item() == pytest.approx(0.4 * 0.7, abs=SHARE)
+    assert share(dark[~over]) == pytest.approx(0.4 * 0.7, abs=SHARE)
     assert_uniform(brightest[dark].log10(), -2.7, -1.3)
     assert brightest.min() >= 10**-2.7 * 0.999
     unclipped = (radiance * draw_exposure(radiance, 0.0, seeded())).amax(dim=1)
@@ -196,7 +191,7 @@ def test_exposure():
     assert torch.isfinite(draw_exposure(torch.zeros(3, 5), 0.5, seeded())).all()
 
 
-def mean_square_of_power(low: float, high: float) -> float:
+def mean_square_of_power(low, high):
     """E[(10^U(low, high))^2]."""
     return (10 ** (2 * high) - 10 ** (2 * low)) / (2 * math.log(10) * (high - low))
 
@@ -210,7 +205,7 @@ def test_sensor_noise(level):
     assert noisy.double().mean().item() == pytest.approx(level, abs=1e-4)
 
 
-def is_multiple(values: Tensor, steps: float) -> Tensor:
+def is_multiple(values, steps):
     """Whether all values (P, F) of a pixel are multiples of 1 / steps."""
     return ((values * steps - (values * steps).round()).abs() < 1e-6).all(dim=1)
 
@@ -223,18 +218,18 @@ def test_quantisation():
     ).double()
     of_srgb = (quantised[..., None] - decoded).abs().amin(dim=2).amax(dim=1) < 1e-6
     eight = is_multiple(quantised, 255)
-    assert of_srgb.double().mean().item() == pytest.approx(0.15, abs=SHARE)
-    assert eight.double().mean().item() == pytest.approx(0.15, abs=SHARE)
+    assert share(of_srgb) == pytest.approx(0.15, abs=SHARE)
+    assert share(eight) == pytest.approx(0.15, abs=SHARE)
     error = quantised - exposed
     # The high byte of 16 is up to a step of 255 too dark or, as 256 steps become 255, a little too
     # bright.
     cut = eight & (error.abs().amax(dim=1) > 0.5001 / 255)
-    assert 0.06 < cut.double().mean().item() <= 0.075 + SHARE
+    assert 0.06 < share(cut) <= 0.075 + SHARE
     assert (error[cut].mean() * 255).item() == pytest.approx(0, abs=0.02)
     assert error[eight & ~cut].abs().max().item() <= 0.5001 / 255
     for bits in (10, 12, 14, 16):
         other = is_multiple(quantised, 2**bits - 1) & ~eight & ~of_srgb
-        assert other.double().mean().item() == pytest.approx(0.7 / 4, abs=SHARE)
+        assert share(other) == pytest.approx(0.7 / 4, abs=SHARE)
         assert error[other].abs().max().item() == pytest.approx(0.5 / (2**bits - 1), rel=0.01)
     assert (quantise(exposed, 0.0, seeded()) - exposed).abs().max() <= 0.5 / 1023 + 1e-9
 
@@ -243,7 +238,7 @@ def test_light_intensities():
     intensities = draw_light_intensities(N, 10, 0.4, seeded())
     assert intensities.amax(dim=1).sub(1).abs().max() == 0
     unequal = intensities.amin(dim=1) < 1
-    assert unequal.float().mean().item() == pytest.approx(0.4, abs=SHARE)
+    assert share(unequal) == pytest.approx(0.4, abs=SHARE)
     # The largest of ten of 2^U(-2, 0) is 2^-0.18 on average, so all others are below the range's
     # upper end by that.
     assert intensities.min() >= 0.25
@@ -260,7 +255,7 @@ def test_restoring_half_of_the_clipped_pixels():
     stored = truth.clamp(max=1) * valid
     restored = restore(stored, clipped, lights, valid, seeded())
     changed = (restored != stored).any(dim=1)
-    assert changed.float().mean().item() == pytest.approx(0.5, abs=0.08)
+    assert share(changed) == pytest.approx(0.5, abs=0.08)
     assert not (restored != stored)[~clipped].any()
     # Seven matte observations determine the others.
     known = changed & ((valid & ~clipped).sum(dim=1) >= 7)
@@ -268,12 +263,12 @@ def test_restoring_half_of_the_clipped_pixels():
     assert (restored - truth)[known][clipped[known]].abs().max() < 0.02
 
 
-def draw_rigs(kind: str, pixels: int, lights: int) -> Floats:
+def draw_rigs(kind, pixels, lights):
     random = seeded(0)
     return draw_light_directions(pixels, lights, random, {kind: 1.0}).double().numpy()
 
 
-def centred_rigs(kind: str, pixels: int, lights: int) -> Floats:
+def centred_rigs(kind, pixels, lights):
     points = draw_rigs(kind, pixels, lights)[..., :2]
     return points - points.mean(axis=1, keepdims=True)
 

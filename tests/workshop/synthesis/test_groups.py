@@ -7,26 +7,26 @@ import pytest
 
 from splinecli.workshop.synthesis import groups, meshes
 from splinecli.workshop.synthesis.groups import draw_body, draw_group, draw_niche
-from splinecli.workshop.synthesis.meshes import REACH, Mesh
+from splinecli.workshop.synthesis.meshes import REACH
 
 pytest.importorskip("skimage", reason="needs the extra 'render'")
 
 
 @pytest.fixture(autouse=True)
-def _coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+def _coarse(monkeypatch):
     """A coarser field, for speed."""
     monkeypatch.setattr(groups, "SPACING", 0.05)
     monkeypatch.setattr("splinecli.workshop.synthesis.shapes.SPACING", 0.05)
     monkeypatch.setattr(groups, "FEWEST_FACES", 500)
 
 
-def ball(radius: float) -> Mesh:
+def ball(radius):
     mesh = meshes.triangulate(meshes.ellipsoid(np.full(3, radius, np.float32)), (1, 1, 1), 0.05)
     assert mesh is not None
     return mesh
 
 
-def test_a_leaning_ball_touches_where_it_stands() -> None:
+def test_a_leaning_ball_touches_where_it_stands():
     first, second = ball(0.5), ball(0.5)
     rng = np.random.default_rng(0)
     for _ in range(20):
@@ -43,7 +43,7 @@ def test_a_leaning_ball_touches_where_it_stands() -> None:
         )
 
 
-def test_facets_have_the_planes_they_are_drawn_from() -> None:
+def test_facets_have_the_planes_they_are_drawn_from():
     field = groups._draw_facets(np.random.default_rng(0), 0.5, 1.0)
     mesh = meshes.triangulate(field, (1.1, 1.1, 1.1), 0.03)
     assert mesh is not None
@@ -54,7 +54,7 @@ def test_facets_have_the_planes_they_are_drawn_from() -> None:
     assert np.quantile(above, 0.95) < 0.01
 
 
-def edge_share(mesh: Mesh) -> float:
+def edge_share(mesh):
     """The share of the faces whose corners' normals are more than 40 degrees apart."""
     normals = mesh.vertex_normals[mesh.faces]
     cosines = (normals * np.roll(normals, 1, axis=1)).sum(axis=2).min(axis=1)
@@ -70,7 +70,7 @@ def test_sharper_grades_have_more_edges(monkeypatch):
     assert np.mean(shares[1]) > 3 * np.mean(shares[0])
 
 
-def test_a_niche_fills_the_frame_and_has_cavities() -> None:
+def test_a_niche_fills_the_frame_and_has_cavities():
     mesh = draw_niche(np.random.default_rng(2), 0.5)
     assert mesh is not None
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
@@ -78,7 +78,7 @@ def test_a_niche_fills_the_frame_and_has_cavities() -> None:
     assert np.ptp(mesh.vertices[(np.abs(mesh.vertices[:, :2]) < 0.9).all(axis=1), 2]) > 0.3
 
 
-def test_groups_are_of_every_kind_and_fit_the_frame() -> None:
+def test_groups_are_of_every_kind_and_fit_the_frame():
     kinds = set()
     for n in range(12):
         kind, mesh = draw_group(np.random.default_rng([3, n]), (), n / 12)

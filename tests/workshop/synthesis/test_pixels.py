@@ -10,7 +10,6 @@ from torch.testing import assert_close
 
 from distributions import seeded
 from splinecli.maths.observation_map import cell_directions
-from splinecli.workshop.synthesis.batches import PixelBatch
 from splinecli.workshop.synthesis.pixels import (
     PixelGenerator,
     PixelGeneratorConfig,
@@ -28,7 +27,7 @@ PLAIN = PixelGeneratorConfig(
 NOTHING = replace(PLAIN, wall_share=0.0, second_wall_share=0.0, ambient_share=0.0, mixed_share=0.0)
 
 
-def draw(pixels: int, config: PixelGeneratorConfig | None = None, seed: int = 0) -> PixelBatch:
+def draw(pixels, config=None, seed=0):
     return PixelGenerator(config or PixelGeneratorConfig(), seeded(seed)).draw(pixels)
 
 
@@ -128,7 +127,7 @@ def test_pixels_of_a_capture_share_its_lights_and_its_exposure():
     assert len(batch.exposure.unique()) == 10
     # Without noise, they show the radiance of their true lights at that exposure.
     exact = draw(160, SHARED)
-    radiance = exact.truth.radiance(exact.light_directions) * exact.exposure * exact.valid  # type: ignore[attr-defined]
+    radiance = exact.truth.radiance(exact.light_directions) * exact.exposure * exact.valid
     clipped = radiance > 1
     assert_close(exact.observations[~clipped], radiance[~clipped], rtol=1e-4, atol=1e-6)
     brightest = exact.observations.unflatten(0, (16, 10)).amax(dim=(0, 2))

@@ -7,18 +7,17 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from scipy import integrate
 
 from distributions import seeded
+from splinecli.maths.normals import unit
 from splinecli.workshop.synthesis.draw_materials import draw_material
 from splinecli.workshop.synthesis.principled import PrincipledMaterial
 
-Vectors = NDArray[np.float64]
 NAMES = tuple(field.name for field in fields(PrincipledMaterial))
 
 
-def material(**values: float) -> PrincipledMaterial:
+def material(**values):
     plain = (
         dict.fromkeys(NAMES, 0.0)
         | {"base": 0.5, "roughness": 0.5, "minnaert": 1.0, "tail_exponent": 2.0}
@@ -29,20 +28,20 @@ def material(**values: float) -> PrincipledMaterial:
     )
 
 
-def hemisphere(count: int, seed: int = 0) -> Vectors:
+def hemisphere(count, seed=0):
     vectors = np.random.default_rng(seed).normal(size=(count, 3))
     vectors[:, 2] = np.abs(vectors[:, 2])
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return unit(vectors)
 
 
-def radiance(surface: PrincipledMaterial, normal: Vectors, lights: Vectors) -> Vectors:
+def radiance(surface, normal, lights):
     n_dot_l = torch.from_numpy(lights @ normal)[None]
     return surface.shade(
         n_dot_l, torch.tensor([[normal[2]]]), torch.from_numpy(lights[:, 2])
     ).numpy()[0]
 
 
-def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
+def burley(surface, n, lights):
     """pi f cos(theta_l), Burley 2012, section 5 and appendix B; specular G without the 2012
     remapping.
 
@@ -64,7 +63,7 @@ def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
         retro,
     ) = (float(getattr(surface, name)) for name in NAMES)
 
-    def facets(nh: float, nl: float, nv: float, roughness: float, gamma: float) -> float:
+    def facets(nh, nl, nv, roughness, gamma):
         alpha = max(roughness, 0.1) ** 2
         area, _ = integrate.quad(
             lambda x: 2 * np.pi * x / (1 + (alpha**2 - 1) * x * x) ** gamma,
@@ -76,10 +75,10 @@ def burley(surface: PrincipledMaterial, n: Vectors, lights: Vectors) -> Vectors:
         ndf = 1 / area / (nh**2 * (alpha**2 - 1) + 1) ** gamma
         return float(ndf * g1(nl, alpha) * g1(nv, alpha))
 
-    def schlick(cosine: float) -> float:
+    def schlick(cosine):
         return float((1 - cosine) ** 5)
 
-    def g1(cosine: float, alpha: float) -> float:
+    def g1(cosine, alpha):
         tangent = np.sqrt(1 - cosine**2) / cosine
         return float(2 / (1 + np.sqrt(1 + (alpha * tangent) ** 2)))
 

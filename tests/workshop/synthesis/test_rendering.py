@@ -27,18 +27,18 @@ class Matte:
 
     reflectance: Tensor
 
-    def take(self, pixels: slice | Tensor) -> Matte:
+    def take(self, pixels):
         return Matte(self.reflectance[pixels])
 
-    def shade(self, n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> Tensor:
+    def shade(self, n_dot_l, n_dot_v, l_dot_v):
         return self.reflectance * n_dot_l.clamp(min=0)
 
-    def albedo(self) -> Tensor:
+    def albedo(self):
         return self.reflectance
 
 
 @pytest.fixture(autouse=True)
-def _no_lobes(monkeypatch: pytest.MonkeyPatch) -> None:
+def _no_lobes(monkeypatch):
     """A matte surface has no sharp lobes that the renderer would soften."""
     soften = rendering.soften
 
@@ -48,13 +48,11 @@ def _no_lobes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rendering, "soften", soften_others)
 
 
-def matte(reflectance: float) -> dict[str, Matte]:
+def matte(reflectance):
     return {"matte": Matte(torch.full((1, 1), reflectance))}
 
 
-def ball(
-    radius: float, *, polar: float, inward: bool, rings: int = 120, sectors: int = 240
-) -> Mesh:
+def ball(radius, *, polar, inward, rings=120, sectors=240):
     """The part of a sphere within `polar` degrees of its pole: +z seen from outside, or -z seen
     from inside.
     """
@@ -77,16 +75,28 @@ def ball(
     )
 
 
-def pixel_centres(view_mask: np.ndarray) -> np.ndarray:
+def pixel_centres(view_mask):
     """x, y (P, 2) of the mask's pixels: rows run down from y = +1."""
     size = len(view_mask)
     rows, columns = np.nonzero(view_mask)
     return np.stack(((columns + 0.5) * 2 / size - 1, 1 - (rows + 0.5) * 2 / size), axis=1)
 
 
-def directions(*vectors: tuple[float, float, float]) -> np.ndarray:
+def directions(*vectors):
     lights = np.array(vectors, np.float32)
     return lights / np.linalg.norm(lights, axis=1, keepdims=True)
+
+
+def direct_light(tracer, visible, lights, materials, patches=None):
+    """Direct light (P, F) on the first of the materials, of one patch."""
+    faces = np.zeros(len(tracer.mesh.faces), np.int64) if patches is None else patches
+    return next(iter(render_direct(tracer, visible, lights, materials, faces).values())).numpy()
+
+
+def mesh_of(corners, faces, normals):
+    return Mesh(
+        np.array(corners, np.float32), np.array(faces, np.int32), np.array(normals, np.float32)
+    )
 
 
 def test_a_matte_ball_is_lambert_s_law_and_lights_nothing_of_itself():
@@ -104,7 +114,7 @@ def test_a_matte_ball_is_lambert_s_law_and_lights_nothing_of_itself():
     assert off[well_inside].max() < 0.3
     lights = directions((0, 0, 1), (0.5, 0.3, 0.8), (-0.7, 0.6, 0.2))
     parts = (tracer, visible, lights, matte(0.7), np.zeros(len(tracer.mesh.faces), np.int64))
-    direct = render_direct(*parts)["matte"].numpy()
+    direct = direct_light(tracer, visible, lights, matte(0.7))
     expected = 0.7 * np.maximum(normals @ lights.T, 0)
     # Cells of the terminator are half lit; elsewhere the mean over a pixel is its middle's value,
     # nearly.
@@ -120,15 +130,15 @@ class Cosines:
     l.v in the second.
     """
 
-    def take(self, pixels: slice | Tensor) -> Cosines:
+    def take(self, pixels):
         return self
 
-    def shade(self, n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> Tensor:
+    def shade(self, n_dot_l, n_dot_v, l_dot_v):
         half = n_dot_l.shape[1] // 2
         return torch.cat((n_dot_v.expand(-1, half), l_dot_v[:, half:]), dim=1)
 
 
-def test_a_ball_seen_from_a_finite_distance() -> None:
+def test_a_ball_seen_from_a_finite_distance():
     radius, distance = 0.8, 4.0
     tracer = Tracer(ball(radius, polar=90, inward=False))
     visible = find_visible_surface(tracer, 64, 3, distance=distance)
@@ -148,23 +158,20 @@ def test_a_ball_seen_from_a_finite_distance() -> None:
     off = np.degrees(np.arccos(np.clip((points / radius * visible.normals).sum(axis=1), -1, 1)))
     assert off[inside].max() < 0.3
     lights = directions((0, 0, 1), (0.3, 0.2, 0.9), (0, 0, 1), (-0.6, 0.1, 0.8))
-    faces = np.zeros(len(tracer.mesh.faces), np.int64)
-    found = render_direct(tracer, visible, lights, {"cosines": Cosines()}, faces)["cosines"].numpy()
+    found = direct_light(tracer, visible, lights, {"cosines": Cosines()})
     expected = np.hstack(
         (np.tile(-(points / radius * rays).sum(axis=1)[:, None], 2), -rays @ lights[2:].T)
     )
     assert np.abs(found - expected)[inside].max() < 0.02
 
 
-def floor_with_wall() -> Mesh:
+def floor_with_wall():
     """The floor z = 0 and a thin wall of height 0.4 that stands on x = 0.2."""
     corners = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]
     corners += [(0.2, -1, 0), (0.2, 1, 0), (0.2, 1, 0.4), (0.2, -1, 0.4)]
     faces = [(0, 1, 2), (0, 2, 3), (4, 6, 5), (4, 7, 6)]
     normals = [(0, 0, 1)] * 4 + [(-1, 0, 0)] * 4
-    return Mesh(
-        np.array(corners, np.float32), np.array(faces, np.int32), np.array(normals, np.float32)
-    )
+    return mesh_of(corners, faces, normals)
 
 
 def test_a_wall_casts_its_shadow():
@@ -173,9 +180,7 @@ def test_a_wall_casts_its_shadow():
     # At 45 degrees behind the wall the shadow is as long as the wall is high; from the front there
     # is none.
     lights = directions((1, 0, 1), (-1, 0, 1))
-    direct = render_direct(tracer, visible, lights, matte(1.0), np.zeros(4, np.int64))[
-        "matte"
-    ].numpy()
+    direct = direct_light(tracer, visible, lights, matte(1.0))
     x = pixel_centres(visible.mask)[:, 0]
     in_shadow = (x > -0.2 + 0.04) & (x < 0.2 - 0.04)
     in_light = (x < -0.2 - 0.04) | (x > 0.2 + 0.04)
@@ -238,9 +243,7 @@ def test_patches_have_their_own_material():
     visible = find_visible_surface(tracer, 20, 2)
     materials = {"matte": Matte(torch.tensor([[0.25], [1.0]]))}
     patch_of_face = np.array([0, 1, 0, 0])  # the floor's triangles meet on its diagonal y = x
-    direct = render_direct(tracer, visible, directions((0, 0, 1)), materials, patch_of_face)[
-        "matte"
-    ][:, 0]
+    direct = direct_light(tracer, visible, directions((0, 0, 1)), materials, patch_of_face)[:, 0]
     x, y = pixel_centres(visible.mask).T
     below, above = y < x - 0.11, y > x + 0.11
     assert_allclose(direct[below], 0.25, rtol=1e-5)
@@ -248,18 +251,15 @@ def test_patches_have_their_own_material():
 
 
 def test_pixels_on_the_outline_are_as_bright_as_their_share_of_the_surface():
-    corners = np.array([(-0.5, -0.5, 0), (0.7, -0.5, 0), (0.7, 0.5, 0), (-0.5, 0.5, 0)], np.float32)
-    up = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
-    tracer = Tracer(Mesh(corners, np.array([(0, 1, 2), (0, 2, 3)], np.int32), up))
+    corners = [(-0.5, -0.5, 0), (0.7, -0.5, 0), (0.7, 0.5, 0), (-0.5, 0.5, 0)]
+    tracer = Tracer(mesh_of(corners, [(0, 1, 2), (0, 2, 3)], [(0, 0, 1)] * 4))
     # Pixels are 0.2 wide. The edge at 0.7 leaves half of a column of pixels, which is 6 of 9
     # samples; the others are cut at their last third, or between pixels.
     visible = find_visible_surface(tracer, 10, 3)
-    direct = render_direct(
-        tracer, visible, directions((0, 0, 1)), matte(1.0), np.zeros(2, np.int64)
-    )["matte"]
+    direct = direct_light(tracer, visible, directions((0, 0, 1)), matte(1.0))
     picture = np.zeros((10, 10))
     picture[visible.mask] = direct[:, 0]
     assert_allclose(picture[3:7, 3:8], 1, rtol=1e-6)
     assert visible.coverage.min() > 0.5
-    assert_allclose(direct[:, 0].numpy(), visible.coverage, rtol=1e-6)
+    assert_allclose(direct[:, 0], visible.coverage, rtol=1e-6)
     assert picture.sum() == pytest.approx(1.2 / 0.04, rel=0.1)

@@ -19,7 +19,7 @@ from splinecli.workshop.synthesis.scenes import (
 SMALL = SceneConfig(size=16, lights=24, samples=2, directions=8, bounces=2)
 
 
-def tent() -> Mesh:
+def tent():
     """Two slopes that meet in a valley along y."""
     corners = np.array(
         [(-1, -1, 1), (0, -1, 0), (0, 1, 0), (-1, 1, 1), (1, -1, 1), (1, 1, 1)], np.float32

@@ -4,7 +4,6 @@ files give them.
 
 import time
 import zipfile
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from splinecli.maths.normals import unit
 from splinecli.workshop.synthesis import meshes
 from splinecli.workshop.synthesis.meshes import (
     REACH,
-    Floats,
     Mesh,
     fit_to_frame,
     read_mesh,
@@ -33,7 +31,7 @@ from splinecli.workshop.synthesis.shapes import (
 pytest.importorskip("skimage", reason="needs the extra 'render'")
 
 
-def points(count: int = 2000, seed: int = 0) -> Floats:
+def points(count=2000, seed=0):
     return np.random.default_rng(seed).uniform(-1, 1, (count, 3)).astype(np.float32)
 
 
@@ -75,7 +73,7 @@ def test_triangles_lie_on_the_zero_with_the_field_s_normals():
     mesh = meshes.triangulate(meshes.torus(0.6, 0.25), (1.0, 1.0, 0.5), 0.03)
     assert np.abs(meshes.torus(0.6, 0.25)(mesh.vertices)).max() < 2e-4
     ring = mesh.vertices * (1, 1, 0)
-    centre = 0.6 * ring / np.linalg.norm(ring, axis=1, keepdims=True)
+    centre = 0.6 * unit(ring)
     expected = (mesh.vertices - centre) / 0.25
     assert (expected * mesh.vertex_normals).sum(axis=1).min() > 0.9999
     # Anticlockwise from outside, closed, and of the volume 2 pi^2 R r^2.
@@ -164,8 +162,7 @@ def test_a_plate_gets_the_normals_of_the_height():
     places[:, 2] = 0
     up = np.tile(np.float32((0, 0, 1)), (500, 1))
     slope = 0.6 * np.cos(2 * np.pi * (places[:, 0] + places[:, 1]) / 0.5)
-    expected = np.stack((-slope, -slope, np.ones(500)), axis=1)
-    expected = unit(expected)
+    expected = unit(np.stack((-slope, -slope, np.ones(500)), axis=1))
     off = np.degrees(np.arccos(np.clip((relief.bend(up, places) * expected).sum(axis=1), -1, 1)))
     assert off.max() < 4.5  # half a texel of 64 along both axes
 
@@ -182,16 +179,16 @@ def test_no_normal_turns_away_from_the_camera():
     assert np.degrees(np.arccos(np.clip((bent * normals).sum(axis=1), -1, 1))).mean() > 3
 
 
-trimesh: Any = pytest.importorskip("trimesh", reason="needs the extra 'render'")
+trimesh = pytest.importorskip("trimesh", reason="needs the extra 'render'")
 
 
-def outward_volume(mesh: Mesh) -> float:
+def outward_volume(mesh):
     """The volume that the faces enclose: positive where they are anticlockwise from outside."""
     a, b, c = (mesh.vertices[mesh.faces[:, corner]].astype(np.float64) for corner in range(3))
     return float((a * np.cross(b, c)).sum() / 6)
 
 
-def area(mesh: Mesh) -> float:
+def area(mesh):
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return float(np.linalg.norm(facing, axis=1).sum() / 2)

@@ -25,7 +25,7 @@ from splinecli.workshop.synthesis.whole_capture import (
 LIGHTS = torch.tensor(spiral_lights(6, 60), dtype=torch.float32)
 
 
-def disc(size: int = 40) -> torch.Tensor:
+def disc(size=40):
     rows, columns = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
     return (rows - 20).square() + (columns - 20).square() < 12**2
 
@@ -95,16 +95,11 @@ def test_round_pieces_turn_away_at_their_rim():
 SHARP = torch.ones(3, 1, 1)
 
 
-def camera(
-    kernels: torch.Tensor = SHARP,
-    demosaic: int | None = None,
-    sharpening: float = 0.0,
-    quality: int | None = None,
-) -> Optics:
+def camera(kernels=SHARP, demosaic=None, sharpening=0.0, quality=None):
     return Optics(kernels, (0.25, 0.5, 0.25), demosaic, sharpening, 1.0, quality)
 
 
-def spread(kernel: torch.Tensor) -> float:
+def spread(kernel):
     """The standard deviation of a kernel along its rows."""
     places = torch.arange(len(kernel)) - len(kernel) // 2
     return float((kernel.sum(0) * places**2).sum().sqrt())

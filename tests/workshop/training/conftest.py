@@ -10,12 +10,12 @@ from tiny_networks import TINY
 
 
 @pytest.fixture(autouse=True)
-def small_validation(monkeypatch: pytest.MonkeyPatch) -> None:
+def small_validation(monkeypatch):
     monkeypatch.setattr(tasks, "VALIDATION_PIXELS", 64)
 
 
 @pytest.fixture
-def tiny() -> TrainingConfig:
+def tiny():
     return TrainingConfig(
         network=NetworkConfig(**TINY),
         pixels=PixelGeneratorConfig(max_lights=16),

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from scenes import put
 from splinecli.errors import ModelError, UsageError
 from splinecli.workshop import training
 from splinecli.workshop.options import parse_light_counts
@@ -29,7 +30,7 @@ def test_round_trip_through_json(name):
 
 
 @pytest.mark.parametrize(
-    ("values", "message"),
+    "values, message",
     [
         (
             {"stepz": 5},
@@ -82,11 +83,6 @@ def test_presets_by_name():
     assert training.DEFAULT_PRESET in PRESETS
 
 
-def write(path: Path, text: str) -> Path:
-    path.write_text(text, "utf-8")
-    return path
-
-
 @pytest.mark.parametrize("asked", [None, "compact"])
 def test_a_toml_file_over_a_preset(tmp_path, asked):
     """A preset that is asked for by name comes before the file's."""
@@ -96,11 +92,11 @@ def test_a_toml_file_over_a_preset(tmp_path, asked):
     base = preset(asked or "paper")
     pixels, network = replace(base.pixels, wall_share=0.3), replace(base.network, map_size=16)
     expected = replace(base, batch_size=64, pixels=pixels, network=network)
-    assert configure(asked, write(tmp_path / "a.toml", text)) == expected
+    assert configure(asked, put(tmp_path / "a.toml", text)) == expected
 
 
 def test_sources_are_replaced_as_a_whole(tmp_path):
-    file = write(tmp_path / "a.toml", '[sources]\n"/data/a" = 2.0\n"/data/b" = 1.0\n')
+    file = put(tmp_path / "a.toml", '[sources]\n"/data/a" = 2.0\n"/data/b" = 1.0\n')
     assert configure(None, file).sources == {"/data/a": 2.0, "/data/b": 1.0}
     assert configure(None, file, [{"sources": {"/data/c": 1.0}}]).sources == {"/data/c": 1.0}
     with pytest.raises(ModelError, match="has no weight above 0"):
@@ -108,11 +104,11 @@ def test_sources_are_replaced_as_a_whole(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text, message",
     [("batch_size = 7", "is 7; expected a multiple of shards = 2"), ("steps = ", "is not TOML")],
 )
 def test_what_is_wrong_in_a_file_names_the_file(tmp_path, text, message):
-    file = write(tmp_path / "a.toml", text)
+    file = put(tmp_path / "a.toml", text)
     with pytest.raises(ModelError, match=message) as caught:
         configure(None, file, [{"seed": 1}])
     assert caught.value.path == file
@@ -132,7 +128,7 @@ def test_files_that_cannot_be_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
+    "text, expected",
     [
         ("seed=3", {"seed": 3}),
         ("pixels.cast_shadows=false", {"pixels": {"cast_shadows": False}}),
@@ -174,7 +170,7 @@ def test_a_setting_that_is_not_given_stays_as_it_was():
 
 
 def test_length_and_rate_of_a_run_may_change(tmp_path):
-    file = write(tmp_path / "a.toml", "steps = 12\nlearning_rate = 1e-4")
+    file = put(tmp_path / "a.toml", "steps = 12\nlearning_rate = 1e-4")
     started = preset("compact", seed=5)
     asked = configure(None, file, [{"minutes": 3.0}], base=started)
     assert asked == preset("compact", seed=5, steps=12, learning_rate=1e-4, minutes=3.0)
@@ -189,7 +185,7 @@ def test_the_home_folder_is_expanded_in_every_path(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
+    "text, expected",
     [("10", (10, 10, 10)), ("4-96", (4, 96, 10)), ("3-8", (3, 8, 8)), ("12-40", (12, 40, 12))],
 )
 def test_light_counts(text, expected):
@@ -205,11 +201,9 @@ def test_sources_of_the_command_line():
 
 
 def test_removed_settings_of_earlier_versions(tmp_path):
-    unused = write(
-        tmp_path / "old.toml", "[pixels]\nmeasured_share = 0.0\nmeasured_materials = ''\n"
-    )
+    unused = put(tmp_path / "old.toml", "[pixels]\nmeasured_share = 0.0\nmeasured_materials = ''\n")
     assert configure("compact", unused) == preset("compact")
-    used = write(tmp_path / "used.toml", "[pixels]\nmeasured_share = 0.5\n")
+    used = put(tmp_path / "used.toml", "[pixels]\nmeasured_share = 0.5\n")
     with pytest.raises(
         ModelError, match=r"measured_share' is 0\.5, but training with measured materials was r"
     ):

@@ -19,7 +19,7 @@ CPU = torch.device("cpu")
 STEPS = 6
 
 
-def environment(**more: str) -> dict[str, str]:
+def environment(**more):
     kept = {
         name: text
         for name, text in os.environ.items()
@@ -28,7 +28,7 @@ def environment(**more: str) -> dict[str, str]:
     return kept | {"OMP_NUM_THREADS": "1"} | more
 
 
-def free_port() -> str:
+def free_port():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return str(probe.getsockname()[1])

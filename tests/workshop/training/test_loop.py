@@ -5,7 +5,6 @@ and it says when it cannot go on.
 import itertools
 import math
 from dataclasses import fields, replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -17,7 +16,6 @@ from splinecli.errors import ModelError
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import load_weights
 from splinecli.workshop.save_weights import save_weights
-from splinecli.workshop.synthesis.batches import PixelBatch
 from splinecli.workshop.synthesis.pixels import PixelGenerator
 from splinecli.workshop.training import CHECKPOINT, METRICS, WEIGHTS, loop
 from splinecli.workshop.training.config import GENERATOR, TrainingConfig, preset
@@ -35,11 +33,11 @@ pytestmark = pytest.mark.usefixtures("no_pictures")
 class OneBatch(PixelGenerator):
     """Draws the same batch again and again."""
 
-    def __init__(self, config: TrainingConfig) -> None:
+    def __init__(self, config):
         super().__init__(config.pixels, seeded(config.seed))
         self.batch = PixelGenerator.draw(self, config.batch_size)
 
-    def draw(self, pixels: int) -> PixelBatch:
+    def draw(self, pixels):
         return self.batch
 
 
@@ -47,7 +45,7 @@ COSINE = TrainingConfig(learning_rate=1.5e-3, warmup_steps=300)
 
 
 @pytest.mark.parametrize(
-    ("config", "step", "progress", "expected"),
+    "config, step, progress, expected",
     [
         (COSINE, 0, 0.0, 1.5e-3 / 300),
         (COSINE, 149, 0.0, 1.5e-3 / 2),
@@ -73,12 +71,12 @@ def test_normals_of_one_batch_are_learnt_by_heart(tiny, tmp_path):
     assert loss < 0.7
 
 
-def losses(trainer: Trainer, steps: int) -> list[float]:
+def losses(trainer, steps):
     return [trainer.step()[0].item() for _ in range(steps)]
 
 
 @pytest.mark.parametrize(
-    ("updates", "pixels"), [("joint", "generator"), ("joint", "set"), ("alternating", "both")]
+    "updates, pixels", [("joint", "generator"), ("joint", "set"), ("alternating", "both")]
 )
 def test_a_run_taken_up_goes_on_as_if_never_stopped(tiny, tmp_path, make_set, updates, pixels):
     sources = {"generator": {GENERATOR: 1.0}, "set": {}, "both": {GENERATOR: 1.0}}[pixels]
@@ -184,7 +182,7 @@ def test_only_the_error_head_learns_of_errors(tiny, tmp_path):
 
 def test_a_run_writes_its_files(tiny, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "REPORT_STEPS", 4)
-    seen: list[tuple[float, Metrics]] = []
+    seen = []
     trainer = Trainer(replace(tiny, steps=10), tmp_path, CPU)
     last = trainer.run(lambda progress, metrics: seen.append((progress, metrics)))
     # And the pictures, which are not drawn here.
@@ -229,22 +227,22 @@ def test_minutes_bound_a_run(tiny, tmp_path, monkeypatch):
     assert trainer.counters.seconds >= 0.6
 
 
-def poison(trainer: Trainer, what: str) -> None:
+def poison(trainer, what):
     """Make the next loss, or its gradient alone, other than finite."""
     parameter = next(trainer.network.ne_net.parameters())
     if what == "loss":
         original = trainer.task.source.draw
 
-        def draw(pixels: int) -> PixelBatch:
+        def draw(pixels):
             batch = original(pixels)
             return replace(batch, observations=batch.observations * torch.nan)
 
-        trainer.task.source.draw = draw  # type: ignore[method-assign]
+        trainer.task.source.draw = draw
     else:
         parameter.register_hook(lambda gradient: gradient * math.inf)
 
 
-@pytest.mark.parametrize(("what", "updates"), [("loss", "joint"), ("gradient", "alternating")])
+@pytest.mark.parametrize("what, updates", [("loss", "joint"), ("gradient", "alternating")])
 def test_what_is_not_finite_ends_the_run_before_it_does_harm(tiny, tmp_path, what, updates):
     trainer = Trainer(replace(tiny, updates=updates), tmp_path, CPU)
     losses(trainer, 2)
@@ -303,7 +301,7 @@ def test_validation_is_the_mean_angle_to_the_truth(tiny):
 
 
 @pytest.fixture
-def trainer(tiny: TrainingConfig, tmp_path: Path) -> Trainer:
+def trainer(tiny, tmp_path):
     made = Trainer(tiny, tmp_path, CPU)
     made.step()
     made.save()

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import map_coordinates
-from torch import Tensor, nn
 from torch.testing import assert_close
 
 from distributions import seeded
@@ -16,7 +15,7 @@ from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.maths.observation_map import cell_directions, sparse_map
 from splinecli.workshop.synthesis.batches import PixelBatch
 from splinecli.workshop.synthesis.pixels import PixelGenerator
-from splinecli.workshop.training.config import TrainingConfig, preset
+from splinecli.workshop.training.config import preset
 from splinecli.workshop.training.loop import Trainer
 from splinecli.workshop.training.objective import (
     AXIS_LENGTH,
@@ -33,14 +32,14 @@ from splinecli.workshop.training.objective import (
 from tiny_networks import random_network
 
 
-def at(zenith_deg: float, azimuth_deg: float = 0.0) -> Tensor:
+def at(zenith_deg, azimuth_deg=0.0):
     """A normal (1, 3) by its angles."""
     zenith, azimuth = math.radians(zenith_deg), math.radians(azimuth_deg)
     x, y = math.sin(zenith) * math.cos(azimuth), math.sin(zenith) * math.sin(azimuth)
     return torch.tensor([[x, y, math.cos(zenith)]], dtype=torch.float64)
 
 
-def random_maps(*shape: int, seed: int = 0) -> Tensor:
+def random_maps(*shape, seed=0):
     return torch.rand(*shape, generator=seeded(seed), dtype=torch.float64)
 
 
@@ -50,9 +49,7 @@ def test_angle(degrees):
     assert math.degrees(angles(at(degrees), at(0)).item()) == pytest.approx(degrees, abs=6e-5)
 
 
-@pytest.mark.parametrize(
-    ("norm", "expected"), [("mean", (0.4 + 0.3) / 2), ("sum", (1.6 + 0.6) / 2)]
-)
+@pytest.mark.parametrize("norm, expected", [("mean", (0.4 + 0.3) / 2), ("sum", (1.6 + 0.6) / 2)])
 def test_map_loss_is_over_the_known_cells_of_each_pixel(norm, expected):
     known = torch.zeros(2, 1, 4, 4, dtype=torch.float64)
     known[0, ..., 1:3, 1:3] = 1
@@ -94,7 +91,7 @@ def test_gradients_in_the_normal_are_finite(length):
     assert torch.isfinite(normal.grad).all()
 
 
-def four_cells(**cells: float) -> Tensor:
+def four_cells(**cells):
     """A map (1, 1, 4, 4) of halves but for cells named r<row>c<column>."""
     maps = torch.full((1, 1, 4, 4), 0.5, dtype=torch.float64)
     for name, value in cells.items():
@@ -105,7 +102,7 @@ def four_cells(**cells: float) -> Tensor:
 # The axis lies along x, so row 0 mirrors row 3 and row 1 row 2. The loss is for eta = 0.1 and
 # lambda_c = 2.
 @pytest.mark.parametrize(
-    ("maps", "filled", "fine", "coarse", "loss"),
+    "maps, filled, fine, coarse, loss",
     [
         (four_cells(), 1.0, 0.0, 0.0, 0.1 + 2 * 0.1),
         # One cell 0.4 too bright, its image 0.4 too dark; of each pooled cell a quarter.
@@ -130,16 +127,16 @@ SILENT = {"angle_weight": 0.0, "map_weight": 0.0, "masked_weight": 0.0}
 
 
 @pytest.fixture
-def network() -> SplineNet:
+def network():
     return random_network().train()
 
 
 @pytest.fixture
-def batch(tiny: TrainingConfig) -> PixelBatch:
+def batch(tiny):
     return PixelGenerator(tiny.pixels, seeded(0)).draw(12)
 
 
-def moved(module: nn.Module) -> bool:
+def moved(module):
     """Whether any parameter has a gradient other than zero."""
     return any(p.grad is not None and bool(p.grad.any()) for p in module.parameters())
 
@@ -176,7 +173,7 @@ def test_the_angle_reaches_li_net_through_the_fixed_ne_net(tiny, network, batch)
 
 
 @pytest.mark.parametrize("part", ["both", "ne_net", "li_net"])
-@pytest.mark.parametrize(("li_net_norm", "ne_net_norm"), [("mean", "sum"), ("sum", "mean")])
+@pytest.mark.parametrize("li_net_norm, ne_net_norm", [("mean", "sum"), ("sum", "mean")])
 def test_the_total_is_the_weighted_sum_of_its_terms(
     tiny, network, batch, part, li_net_norm, ne_net_norm
 ):

@@ -1,7 +1,6 @@
 """Whole scenes as captures, and the training of the refinement net on them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,12 +14,12 @@ from splinecli.estimate.networks.refine_net import FEATURE_CHANNELS, channels
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import load_weights, resolve_weights
 from splinecli.maths.normals import unit
-from splinecli.workshop.pixel_sets.store import Pixels, PixelSet, PixelSetWriter
+from splinecli.workshop.pixel_sets.store import Pixels, PixelSetWriter
 from splinecli.workshop.save_weights import save_weights
 from splinecli.workshop.synthesis.batches import CaptureConfig
 from splinecli.workshop.synthesis.whole_capture import photograph_scene
 from splinecli.workshop.training import WEIGHTS, refinement, tasks
-from splinecli.workshop.training.config import PRESETS, TrainingConfig
+from splinecli.workshop.training.config import PRESETS
 from splinecli.workshop.training.loop import Trainer
 from splinecli.workshop.training.refinement import (
     STEPS_PER_EXAMPLE,
@@ -42,7 +41,7 @@ FLAWLESS = CaptureConfig(
 )
 
 
-def scene(pixels: int = 300, lights: int = 8) -> tuple[torch.Tensor, torch.Tensor]:
+def scene(pixels=300, lights=8):
     generator = seeded(3)
     directions = torch.randn(lights, 3, generator=generator).abs()
     directions = normalize(directions, dim=1)
@@ -99,7 +98,7 @@ def test_saturated_captures_are_restored():
 
 
 @pytest.fixture
-def bumpy_set(tmp_path: Path) -> PixelSet:
+def bumpy_set(tmp_path):
     """Two matte scenes of 14 x 14 pixels, a smooth normal each, whose pixels are disturbed one by
     one.
     """
@@ -109,8 +108,7 @@ def bumpy_set(tmp_path: Path) -> PixelSet:
         lights = rng.normal((0, 0, 2), 1, (9, 3))
         lights[:, 2] = np.abs(lights[:, 2]) + 0.5
         lights = unit(lights).astype(np.float32)
-        normals = np.tile(np.float32((0.28 * index, 0, 0.96)), (196, 1))
-        normals = unit(normals)
+        normals = unit(np.tile(np.float32((0.28 * index, 0, 0.96)), (196, 1)))
         observations = (normals @ lights.T).clip(0) * rng.uniform(0.5, 1.5, (196, 9))
         mask = np.ones((14, 14), np.bool_)
         writer.add(
@@ -124,14 +122,12 @@ def bumpy_set(tmp_path: Path) -> PixelSet:
 
 
 @pytest.fixture
-def refining(
-    tiny: TrainingConfig, bumpy_set: PixelSet, monkeypatch: pytest.MonkeyPatch
-) -> TrainingConfig:
+def refining(tiny, bumpy_set, monkeypatch):
     for name, value in (("FIRST_EXAMPLES", 3), ("VALIDATION_SCENES", 2)):
         monkeypatch.setattr(tasks, name, value)
-    monkeypatch.setattr(refinement, "_ENGRAVED_SHARE", 0.0)
-    monkeypatch.setattr(refinement, "_BACKGROUND_SHARE", 0.0)
-    monkeypatch.setattr(refinement, "_ENLARGED_SHARE", 0.0)  # interpolated noise looks blurred
+    monkeypatch.setattr(refinement, "ENGRAVED_SHARE", 0.0)
+    monkeypatch.setattr(refinement, "BACKGROUND_SHARE", 0.0)
+    monkeypatch.setattr(refinement, "ENLARGED_SHARE", 0.0)  # interpolated noise looks blurred
     return replace(
         tiny,
         network=replace(tiny.network, error_head=True, refines=True),
@@ -160,7 +156,7 @@ def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(refining, t
 
 @pytest.mark.usefixtures("no_pictures")
 def test_a_second_refinement_net_follows_one_that_is_trained(refining, tmp_path):
-    Trainer(refining, tmp_path / "first", CPU).run()
+    Trainer(replace(refining, steps=5), tmp_path / "first", CPU).run()
     start_from = str(tmp_path / "first" / WEIGHTS)
     twice = replace(
         refining,
@@ -195,7 +191,7 @@ def test_the_preset_continues_the_weights_that_it_starts_from():
     assert resolve_weights(refine.start_from).network.config == refine.network
 
 
-def network_of(config: TrainingConfig) -> SplineNet:
+def network_of(config):
     torch.manual_seed(0)
     return SplineNet(config.network)
 
@@ -274,7 +270,7 @@ def test_the_loss_of_detail_does_not_count_what_turns_all_normals(refining):
         assert least < (with_detail - without) / without < most
 
 
-def test_pixels_at_edges_count_more(refining: TrainingConfig) -> None:
+def test_pixels_at_edges_count_more(refining):
     """A plate with a step of 90 degrees, and the estimate off by 10 degrees at the step alone."""
     network = network_of(refining)
     truth = torch.zeros(1, 3, 8, 16)
@@ -300,7 +296,7 @@ def test_pixels_at_edges_count_more(refining: TrainingConfig) -> None:
     assert (weighted - plain).item() == pytest.approx(expected, rel=0.02)
 
 
-def test_the_removed_blur_is_an_input(refining: TrainingConfig, bumpy_set: PixelSet) -> None:
+def test_the_removed_blur_is_an_input(refining, bumpy_set):
     network = network_of(refining)
     config = replace(refining.pixels, optics_share=1.0)
     pool = ScenePool([(bumpy_set, bumpy_set.entries, 1.0)], network, config, 3)

@@ -2,7 +2,6 @@
 
 import csv
 from dataclasses import fields, replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -20,7 +19,7 @@ ROWS = [
 ]
 
 
-def log_of(folder: Path, rows: list[Metrics] = ROWS, *, tensorboard: bool = False) -> None:
+def log_of(folder, rows=ROWS, *, tensorboard=False):
     log = RunLog(folder, 0, tensorboard=tensorboard)
     for row in rows:
         log.append(row)
@@ -37,7 +36,7 @@ def test_metrics_round_trip(tmp_path):
         assert len(list(csv.reader(file))) == 4
 
 
-@pytest.mark.parametrize(("step", "kept"), [(49, 0), (50, 1), (10**6, 3)])
+@pytest.mark.parametrize("step, kept", [(49, 0), (50, 1), (10**6, 3)])
 def test_lines_of_a_later_step_are_dropped(tmp_path, step, kept):
     log_of(tmp_path)
     again = RunLog(tmp_path, step)

@@ -10,14 +10,13 @@ import torch
 
 from distributions import seeded
 from splinecli.errors import InputError
-from splinecli.workshop.pixel_sets.store import Entry, PixelSet
-from splinecli.workshop.synthesis.batches import PixelBatch
+from splinecli.workshop.pixel_sets.store import Entry
 from splinecli.workshop.synthesis.pixels import PixelGenerator
-from splinecli.workshop.training.config import GENERATOR, TrainingConfig
-from splinecli.workshop.training.tasks import PixelSource, open_sets, pixel_source, split_scenes
+from splinecli.workshop.training.config import GENERATOR
+from splinecli.workshop.training.tasks import open_sets, pixel_source, split_scenes
 
 
-def open_sources(config: TrainingConfig, seed: int = 0) -> tuple[PixelSource, PixelSource]:
+def open_sources(config, seed=0):
     """The sources of training and validation pixels."""
     opened = open_sets(config)
     return (
@@ -26,7 +25,7 @@ def open_sources(config: TrainingConfig, seed: int = 0) -> tuple[PixelSource, Pi
     )
 
 
-def parts(batch: PixelBatch) -> tuple[torch.Tensor, ...]:
+def parts(batch):
     return (
         batch.observations,
         batch.light_directions,
@@ -36,12 +35,12 @@ def parts(batch: PixelBatch) -> tuple[torch.Tensor, ...]:
     )
 
 
-def entries_of(*scenes: str) -> list[Entry]:
+def entries_of(*scenes):
     return [Entry(f"e{i}", scene, "", {}, 1, 3, {}) for i, scene in enumerate(scenes)]
 
 
 @pytest.mark.parametrize(
-    ("scenes", "share", "n_validation"),
+    "scenes, share, n_validation",
     [
         (("a", "a", "b", "b", "c", "c"), 0.1, 1),
         (("a", "b", "a", "b"), 0.1, 1),
@@ -65,7 +64,7 @@ def test_validation_takes_whole_scenes_and_never_all(scenes, share, n_validation
     assert {entry.scene for entry in again} == for_validation
 
 
-def rows_of(pixel_set: PixelSet, *names: str) -> set[tuple[float, ...]]:
+def rows_of(pixel_set, *names):
     return {
         tuple(normal)
         for entry in pixel_set.entries
@@ -74,7 +73,7 @@ def rows_of(pixel_set: PixelSet, *names: str) -> set[tuple[float, ...]]:
     }
 
 
-def normals_of(batch: PixelBatch) -> set[tuple[float, ...]]:
+def normals_of(batch):
     return {tuple(normal) for normal in batch.truth.normals.tolist()}
 
 

@@ -48,7 +48,7 @@ STEPS_PER_EXAMPLE = 6
 MOST_EXAMPLES = 2000  # of about a megabyte each; later ones replace the oldest
 # Shares of the scene captures that are enlarged, and of all captures with a background and of
 # engraved pieces.
-_ENLARGED_SHARE, _BACKGROUND_SHARE, _ENGRAVED_SHARE = 0.3, 0.35, 0.4
+ENLARGED_SHARE, BACKGROUND_SHARE, ENGRAVED_SHARE = 0.3, 0.35, 0.4
 
 
 class SceneMaps(NamedTuple):
@@ -103,7 +103,7 @@ class ScenePool:
         self._made += 1
 
     def draw_scene(
-        self, generator: torch.Generator, engraved_share: float = _ENGRAVED_SHARE
+        self, generator: torch.Generator, engraved_share: float = ENGRAVED_SHARE
     ) -> Scene:
         """Draw a part of a scene, or an engraved piece, and the lights of its capture."""
         config = self.config
@@ -120,7 +120,7 @@ class ScenePool:
         chosen = choose_in_cone(lights, count, generator)
         mask = torch.from_numpy(np.array(pixels.mask))
         scale = 1 + 2.0 * float(torch.rand((), generator=generator))
-        scale = scale if torch.rand((), generator=generator) < _ENLARGED_SHARE else 1.0
+        scale = scale if torch.rand((), generator=generator) < ENLARGED_SHARE else 1.0
         # A part of the map around a random pixel of the object.
         places, side = mask.nonzero(), round(96 / scale)
         middle = places[int(torch.randint(len(places), (), generator=generator))].tolist()
@@ -147,7 +147,7 @@ class ScenePool:
         """Photograph maps (F + 3, H, W) of radiance and true normals, and return SPLINE-Net's
         estimates.
         """
-        if torch.rand((), generator=generator) < _BACKGROUND_SHARE:
+        if torch.rand((), generator=generator) < BACKGROUND_SHARE:
             maps, mask = add_background(maps, mask, lights, generator)
         else:  # a dark margin, which a lens and its inverse filter mix with the outline
             maps, mask = pad(maps * mask, (REACH,) * 4), pad(mask, (REACH,) * 4)
