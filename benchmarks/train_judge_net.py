@@ -153,8 +153,8 @@ def render(seed: int, index: int) -> Iterator[Rendered]:
 
 def shading(name: str, strength: float, cosines: Array, light_z: Array, normal_z: Array) -> Array:
     """Return the shading (P, F) of a material without cast shadows, under lights with the given z:
-    exactly matte; retroreflecting; rough, after Oren and Nayar (1994); or translucent, so that light which enters
-    comes out beyond the terminator.
+    exactly matte; retroreflecting; rough, after Oren and Nayar (1994); or translucent, so that
+    light which enters comes out beyond the terminator.
     """
     if name == TRANSLUCENT:
         return np.asarray((cosines + strength).clip(0) / (1 + strength))

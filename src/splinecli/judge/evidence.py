@@ -23,7 +23,7 @@ from splinecli.judge.explanations import (
     Kind,
     constant_light,
 )
-from splinecli.judge.judge_net import CLASSES, features_of, judge_net
+from splinecli.judge.judge_net import CLASSES, RIGHT, features_of, judge_net
 from splinecli.judge.light_check import LightCheck, check_lights
 from splinecli.judge.odd_images import ImageShift, find_shifts
 from splinecli.judge.shading_shifts import moved_back, shading_shifts
@@ -179,8 +179,8 @@ class Evidence:
 
     @cached_property
     def doubt(self) -> Doubt | None:
-        """The other reading that is most probably right, and its probability; None if the readings
-        cannot be compared.
+        """The other reading that is most probably right, and its probability; None if the given
+        reading is more probable, or the readings cannot be compared.
         """
         shares, readings = self.shares, self.explanations.readings
         kinds = set(readings) - self.accepted
@@ -193,6 +193,8 @@ class Evidence:
         if not kinds:
             return None
         best, *others = sorted(kinds, key=lambda kind: -shares[kind])
+        if shares[best] < shares[RIGHT]:
+            return None
         total = float(sum(shares[kind] for kind in kinds))
         # Explanations that are this likely, compared with the likeliest one, are named beside it.
         likely = tuple(kind for kind in others if shares[kind] > 0.3 * shares[best])

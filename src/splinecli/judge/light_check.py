@@ -38,7 +38,7 @@ _RIM_WEIGHT, _TOLD_APART, _ROTATED = 1.0, 0.5, 4.0
 
 # Lights of metals, of which three images leave more, are only doubted. Others that are corrected
 # leave at most the second share of the residual of random orders.
-_METALLIC, _FITS_WELL = 0.25, 0.25
+_METALLIC, _FITS_WELL, _CLEARLY_BETTER = 0.25, 0.25, 2.0
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,9 @@ class LightCheck:
         if self.mended is None or self.residual > _METALLIC:
             return False
         better = self.order_misfit < min(0.5 * self.given_misfit, _FITS_WELL)
-        return (self.order is None or better) and (self.best is None or self.best.advantage >= 2)
+        return (self.order is None or better) and (
+            self.best is None or self.best.advantage >= _CLEARLY_BETTER
+        )
 
     @property
     def outline_tells(self) -> bool:
@@ -212,6 +214,9 @@ def _check_frame_and_order(
     ]
     order, mended, turn_deg = found.order, None, None
     best = None if order == UNKNOWN_ORDER else _best(ranked, in_order=order is not None)
+    residual = 0.0 if factors is None else factors.residual
+    if best is not None and residual > _METALLIC and best.advantage < _CLEARLY_BETTER:
+        best = None
     if best is not None:
         mended = found.lights @ best.matrix.T
     elif order not in (None, UNKNOWN_ORDER):
@@ -238,7 +243,7 @@ def _check_frame_and_order(
         mended=mended if clear else None,
         error_deg=turn_deg,
         shadows_tell=shadows_tell,
-        residual=0.0 if factors is None else factors.residual,
+        residual=residual,
         lacks_shadows=lacks_shadows and not (order or best or check.outline_tells),
     )
 

@@ -62,7 +62,9 @@ def find_odd_image(factors: Factors, light_directions: Float64Array) -> OddImage
     left = float(np.linalg.norm(np.delete(factors.image_residuals, first)))
     # An odd image's residual is above the first, as a share of its brightness, and this many times
     # any other's.
-    if residuals[first] > max(0.25, 2.5 * residuals[second]) and left < 0.15:
+    if residuals[first] > max(0.25, 2.5 * residuals[second]) and left < min(
+        0.15, 0.6 * factors.residual
+    ):
         return OddImage(int(first), left / factors.residual)
     return None
 
