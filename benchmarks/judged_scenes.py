@@ -1,6 +1,7 @@
 """Scenes for benchmarks/judgement.py: shapes, materials and arrangements of lights by name.
 
-Shapes and arrangements differ from those that weights are trained on and checks are fitted to. The renderer is the project's own, with cast shadows and light between surfaces.
+Shapes and arrangements differ from those that weights are trained on and checks are fitted to. The
+renderer is the project's own, with cast shadows and light between surfaces.
 """
 
 import math
