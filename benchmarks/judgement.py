@@ -98,10 +98,11 @@ def as_given(folder: Path, options: InferOptions, load: Callable[[], Any]) -> di
 
 
 def named_remedies(warnings: Iterable[dict[str, Any]]) -> Iterator[tuple[str, str, list[str]]]:
-    """Yield the code of each warning that names a remedy, the remedy, and its values.
+    """Yield the code of each warning that names a remedy, the remedy, and its values, once each.
 
     Of two frames, the user knows which is right: they are one remedy. Two curves are two.
     """
+    done = []
     for warning in warnings:
         if warning["code"] in UNDO:
             continue
@@ -109,7 +110,9 @@ def named_remedies(warnings: Iterable[dict[str, Any]]) -> Iterator[tuple[str, st
             for found in re.finditer(pattern, warning["text"]):
                 values = [value for value in found.groups() if value is not None]
                 for group in [values] if name == "frame" else [[value] for value in values]:
-                    yield warning["code"], name, group
+                    if (name, group) not in done:
+                        done.append((name, group))
+                        yield warning["code"], name, group
 
 
 def measure_one(folder: Path, options: InferOptions, load: Callable[[], Any]) -> dict[str, Any]:
