@@ -328,10 +328,14 @@ def draw_lights(name: str, count: int, widest_deg: float, rng: Random) -> Floats
         elif name == "hand-held":
             polar = rng.uniform(12, widest_deg, count)
             azimuth = np.sort(azimuth[0] + rng.uniform(0, rng.uniform(4.2, 6.3), count))
-        else:  # an arc beside the view
-            along = np.tan(np.radians(np.linspace(-1, 1, count) * min(widest_deg - 5, 60)))
-            beside = rng.uniform(0.3, 0.7) + rng.normal(0, 0.08, count)
-            polar = np.degrees(np.arctan(np.hypot(along, beside))).clip(max=widest_deg)
+        elif rng.random() < 0.5:  # an arc from one side over the top to the other
+            arc = np.radians(rng.uniform(150, 230))
+            azimuth = azimuth[0] + np.linspace(0, arc, count) + rng.normal(0, 0.05, count)
+            polar = np.full(count, rng.uniform(35, min(60, widest_deg))) + rng.normal(0, 3, count)
+        else:  # a line beside the view, placed by hand: a straight rail would be in one plane
+            along = np.linspace(-1, 1, count) * 0.95 * np.sin(np.radians(widest_deg))
+            beside = rng.uniform(0.25, 0.45) + rng.normal(0, 0.12, count)
+            polar = np.degrees(np.arcsin(np.hypot(along, beside).clip(max=0.999)))
             azimuth = np.arctan2(beside, along) + azimuth[0]
         polar = np.radians(np.clip(polar, 3, widest_deg))
         across = np.sin(polar)
