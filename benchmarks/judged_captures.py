@@ -40,7 +40,7 @@ FAULTS: dict[str, tuple[Sequence[str], Sequence[str]]] = {
     "moved_one": (("6",), ("images_shifted", "image_inconsistent")),
     "moved_half": (("6",), ("images_shifted",)),
     "defocus": (("2", "4"), ("soft_images",)),
-    "odd_lamp": (("elsewhere", "failed"), ("image_inconsistent", "image_scale")),
+    "odd_lamp": (("elsewhere", "failed"), ("image_inconsistent", "image_scale", "dark_images")),
     "dark": (("0.2",), ("dark_images",)),
 }
 """For each kind of fault its degrees, and the codes of the warnings that name it."""
