@@ -3,6 +3,7 @@
 import importlib
 import math
 import re
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -266,3 +267,27 @@ def test_materials(run):
     printed = run("materials --scenes 1 --size 16 --sets metallic").splitlines()
     assert "material" in printed[0]
     assert [line.split("|")[1].strip() for line in printed[3:5]] == ["all", "highlight observable"]
+
+
+@pytest.mark.usefixtures("coarse_shapes")
+def test_judgement(run, tmp_path):
+    """Captures are the same at each run, and each is measured once."""
+    pytest.importorskip("embreex", reason="needs the extra 'render'")
+    made, found = tmp_path / "made", tmp_path / "found"
+    counts = ("--right", "2", "--faulty", "4")
+    run("judgement", "render", str(made), *counts, "--part", "1/2")
+    first = (made / "000.right.file/im_01.png").read_bytes()
+    shutil.rmtree(made / "000.right.file")
+    run("judgement", "render", str(made), *counts)
+    assert (made / "000.right.file/im_01.png").read_bytes() == first
+    assert read_json(made / "003.tilt.15/truth.json")["kind"] == "tilt"
+    run("judgement", "measure", str(made), str(found), "--method", "ls")
+    stored = sorted(found.glob("*.json"))
+    assert len(stored) == 6
+    measured = stored[0].stat().st_mtime_ns
+    run("judgement", "measure", str(made), str(found), "--method", "ls")
+    assert stored[0].stat().st_mtime_ns == measured
+    assert all(read_json(path)["mae"] < 60 for path in stored)
+    printed = run("judgement", "report", str(found))
+    assert "| tilt | 3 | 0 |" in printed
+    assert run("judgement", "report", str(found), str(found)) == printed
