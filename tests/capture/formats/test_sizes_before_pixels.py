@@ -19,8 +19,12 @@ from scipy.io import savemat
 from scenes import png_chunk, write_image
 from splinecli.capture import open_capture
 from splinecli.capture.formats.facts import read_header
-from splinecli.capture.formats.images import check_stored_size, decode_image
-from splinecli.capture.formats.normal_files import read_ground_truth, read_normal_map
+from splinecli.capture.formats.images import ExpectedSize, check_stored_size, decode_image
+from splinecli.capture.formats.normal_files import (
+    read_depth,
+    read_ground_truth,
+    read_normal_map,
+)
 from splinecli.capture.light_files import read_light_directions
 from splinecli.errors import InputError
 from splinecli.lights.calibration.balls import calibrate_ball, find_ball_files
@@ -268,6 +272,35 @@ def test_light_files_with_too_much_text(tmp_path):
     ):
         (tmp_path / "a.txt").write_text(text)
         refused(lambda: read_light_directions(tmp_path / "a.txt"), message)
+
+
+def test_matrices_of_which_none_can_be_the_lights(tmp_path):
+    """A hundred that expand to 8 MB each."""
+    content, rows = b" " * 124 + b"\0\1IM", 1 << 18
+    for number in range(100):
+        matrix = struct.pack("<IIII", 6, 8, 6, 0) + struct.pack("<IIII", 5, 8, rows, 3)
+        matrix += struct.pack("<HH", 1, 3) + b"m%02d\0" % number
+        matrix += struct.pack("<II", 2, 3 * rows) + bytes(3 * rows)
+        packed = zlib.compress(struct.pack("<II", 14, len(matrix)) + matrix)
+        content += struct.pack("<II", 15, len(packed)) + packed
+    (tmp_path / "lights.mat").write_bytes(content)
+    message = r"found several matrices N x 3 or 3 x N: m00 \(262144 x 3\), .* and 94 more"
+    refused(lambda: read_light_directions(tmp_path / "lights.mat", 8), message)
+
+
+def test_a_depth_with_a_thousand_channels(tmp_path):
+    library = pytest.importorskip("OpenEXR")
+    depth, header = np.zeros((300, 300), np.float32), {"compression": library.ZIP_COMPRESSION}
+    channels = {f"c{number}": depth for number in range(1000)}
+    library.File(header, channels).write(str(tmp_path / "a.exr"))
+    parts = [
+        library.Part({"name": name}, {"Z": depth, name: depth}) for name in map(str, range(150))
+    ]
+    library.File(parts).write(str(tmp_path / "parts.exr"))
+    size = ExpectedSize(depth.shape, "the normal map")
+    for name, count in (("a.exr", 1000), ("parts.exr", 300)):
+        message = f"found {count} channels, expected at most 256. Save the depth alone"
+        refused(lambda name=name: read_depth(tmp_path / name, size), message)
 
 
 def test_an_image_larger_than_the_memory(monkeypatch):
