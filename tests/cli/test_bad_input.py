@@ -4,6 +4,7 @@ The texts stand in tests/golden/bad_input/, a file a case. Usage errors name wha
 was expected; those of the parser also the help.
 """
 
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -143,6 +144,21 @@ USAGE_ERRORS = {
 def test_usage_errors(run):
     for arguments, message in USAGE_ERRORS.items():
         assert run(*arguments.split()) == (2, "", f"splinecli: {message}\n")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows keeps the folder")
+@pytest.mark.parametrize(
+    "arguments",
+    ["infer {} --method ls -o .", "integrate {} -o .", "info {} --json", "prepare -o s"],
+)
+def test_a_current_folder_that_was_removed(arguments, capture, run, tmp_path, monkeypatch):
+    """A file cannot be created in it, although the folder exists for the system."""
+    (tmp_path / "removed").mkdir()
+    monkeypatch.chdir(tmp_path / "removed")
+    (tmp_path / "removed").rmdir()
+    result = run(*arguments.format(tmp_path / capture).split())
+    message = "the current folder was removed. Change to another folder."
+    assert (result.code, result.err) == (2, f"splinecli: {message}\n")
 
 
 @pytest.mark.parametrize("option", ["--crosstalk", "--mask", "--output"])
