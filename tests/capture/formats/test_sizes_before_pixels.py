@@ -10,14 +10,17 @@ import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
+import tifffile
 from scipy.io import savemat
 
 from scenes import png_chunk, write_image
 from splinecli.capture import open_capture
+from splinecli.capture.formats import decoders
 from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.images import ExpectedSize, check_stored_size, decode_image
 from splinecli.capture.formats.normal_files import (
@@ -262,6 +265,26 @@ def test_a_picture_with_gigabytes_behind_it(tmp_path):
             lambda name=name: decode_image(tmp_path / name),
             r"found 2147\.5 MB, expected at most 67\.1 MB",
         )
+
+
+def test_the_pages_of_a_long_tiff(tmp_path, monkeypatch):
+    """Of each page only its parts are read, and the pages are found once: together they would take
+    time in the square of their number.
+    """
+    pictures = [np.full(SMALL, 9 * number, np.uint16) for number in range(20)]
+    tifffile.imwrite(tmp_path / "plain.tif", np.array(pictures), photometric="minisblack")
+    cv2.imwritemulti(str(tmp_path / "packed.tif"), pictures)  # LZW, which only OpenCV decodes
+    for name in ("plain.tif", "packed.tif"):
+        with (tmp_path / name).open("ab") as file:
+            file.truncate(1 << 31)
+        listed = decoders.pages(tmp_path / name)
+        assert len(listed) == 20
+        walk = Mock(wraps=decoders._places)
+        monkeypatch.setattr(decoders, "_places", walk)
+        for page, picture in zip(listed, pictures, strict=True):
+            assert np.array_equal(decode_image(page)[..., 0], picture)
+        assert walk.call_count < 5  # those of the first page are not searched
+        assert growth(lambda listed=listed: [decode_image(page) for page in listed]) < MOST_GROWTH
 
 
 def test_light_files_with_too_much_text(tmp_path):
