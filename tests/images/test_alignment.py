@@ -245,6 +245,11 @@ def test_captures_that_cannot_be_aligned_are_refused(
     for options in ({"light_indices": (0, 1, 2, 3)}, {"n_lights": 4}):
         with pytest.raises(UsageError, match="leaves 4 images, but --align needs at least 5"):
             infer(write_moved(), tmp_path, **options)
+    for crop, size in (("60,60,30,1", "30 x 1"), ("60,60,1,30", "1 x 30"), ("60,60,1,1", "1 x 1")):
+        with pytest.raises(
+            InputError, match=f"found an object of {size} pixels, expected .* 8 x 8"
+        ):
+            infer(write_moved(), tmp_path, crop=crop)
 
 
 def test_large_captures_are_reduced(monkeypatch: pytest.MonkeyPatch) -> None:
