@@ -3,6 +3,7 @@ exact.
 """
 
 import json
+import tracemalloc
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -193,6 +194,27 @@ def test_pixels_that_an_image_lacks_are_not_common() -> None:
     transforms[1, :2, 2] = 2.0, -1.0
     common = common_pixels(transforms, (4, 6))
     assert common.tolist() == [[False] * 6, *[[True] * 4 + [False] * 2] * 3]
+
+
+@pytest.mark.parametrize(
+    ("work", "most"),
+    [
+        # the nearest pixels in two bytes, and the interpolated ones in four
+        (lambda image, motion: resample(image, image.astype(np.float32), motion), 6 + 4),
+        (lambda image, motion: common_pixels(motion[None], image.shape[:2]), 1),
+    ],
+)
+def test_whole_images_take_no_memory_but_for_their_values(
+    work: Callable[[Any, Floats], object], most: int
+) -> None:
+    """The memory of a capture is checked before it is read, without the places of its pixels."""
+    image, motion = np.ones((1000, 1000, 1), np.uint16), np.eye(3)
+    motion[:2, 2] = 1.5, -0.5
+    tracemalloc.start()
+    work(image, motion)
+    taken = tracemalloc.get_traced_memory()[1] / image.size
+    tracemalloc.stop()
+    assert taken < most + 5
 
 
 @pytest.fixture
