@@ -65,6 +65,13 @@ def remove_images(capture: Path) -> None:
         path.unlink()
 
 
+def without_pixels(capture: Path) -> list[object]:
+    """PGM files are recognised by their content."""
+    for path in (*capture.glob("image*.png"), capture / "mask.png"):
+        path.write_bytes(b"P5\n0 0\n255\n")
+    return ["--auto-mask"]
+
+
 def keep_two_images(capture: Path) -> None:
     for index in range(3, 9):
         (capture / f"image{index}.png").unlink()
@@ -75,6 +82,7 @@ CASES: list[tuple[str, int, Spoil]] = [
     ("corrupt image", 3, write("image2.png", b"\x89PNG\r\n\x1a\nrubbish")),
     ("truncated image", 3, truncate),
     ("not an image", 3, write("image2.png", b"text")),
+    ("images without pixels", 3, without_pixels),
     ("images of different sizes", 3, write("image2.png", np.ones((24, 25), np.uint16))),
     ("mask of another size", 3, write("mask.png", np.full((20, 24), 255, np.uint8))),
     ("mask all zero", 3, write("mask.png", np.zeros((24, 24), np.uint8))),

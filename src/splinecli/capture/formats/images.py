@@ -51,11 +51,13 @@ class ExpectedSize:
 def check_stored_size(
     shape: tuple[int, ...], item_bytes: int, path: Path, expected: ExpectedSize | None = None
 ) -> None:
-    """Raise InputError if an image (H, W) or (H, W, C) is not of the expected size, or too large to
-    be read.
+    """Raise InputError if an image (H, W) or (H, W, C) is not of the expected size, has no pixels,
+    or is too large to be read.
     """
     if expected is not None:
         expected.check(shape, path)
+    if 0 in shape[:2]:
+        raise InputError(f"found an image of {_size(shape)} pixels, expected at least one", path)
     n_pixels, n_bytes = math.prod(shape[:2]), image_bytes(shape, item_bytes)
     takes = f"found an image of {_size(shape)} pixels, which takes"
     if n_pixels > LARGEST_IMAGE:
