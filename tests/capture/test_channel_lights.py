@@ -93,6 +93,19 @@ def test_the_intensities_of_the_lamps_are_divided_out(tmp_path):
     assert errors_deg(folder, tmp_path / "out", LIGHTS).max() < 0.2
 
 
+def test_each_image_has_its_flat_field(tmp_path):
+    """The lamps of the two images fall off towards opposite sides."""
+    falloff = np.linspace(0.4, 1, 90)[:, None, None] * np.ones((90, 90, 3))
+    falloff = np.stack((falloff, falloff[::-1]))
+    folder, flats = tmp_path / "gray", tmp_path / "flats"
+    write_capture(folder, to_uint16(photograph(LIGHTS, np.eye(3)) * falloff), LIGHTS, mask=MASK)
+    write_capture(flats, to_uint16(falloff * 50_000), None)
+    assert errors_deg(folder, tmp_path / "out", LIGHTS, flat_field=str(flats)).max() < 0.2
+    write_capture(flats, to_uint16(falloff[:1] * 50_000), None, first=2)
+    with pytest.raises(InputError, match="found 3 flat-field images, expected 1 or 2, one for"):
+        normals_of(folder, tmp_path / "other", flat_field=str(flats))
+
+
 def test_crosstalk_is_measured_on_a_gray_ball(tmp_path):
     write_capture(tmp_path / "ball", photograph(LIGHTS), None, mask=MASK)
     found = measure_crosstalk(find_ball_files(tmp_path / "ball"), LIGHTS)

@@ -4,6 +4,7 @@ The texts stand in tests/golden/bad_input/, a file a case. Usage errors name wha
 was expected; those of the parser also the help.
 """
 
+import os
 import sys
 from pathlib import Path
 
@@ -57,6 +58,13 @@ def remove_images(capture):
         path.unlink()
 
 
+def without_pixels(capture):
+    """PGM files are recognised by their content."""
+    for path in (*capture.glob("image*.png"), capture / "mask.png"):
+        path.write_bytes(b"P5\n0 0\n255\n")
+    return ["--auto-mask"]
+
+
 def keep_two_images(capture):
     for index in range(3, 9):
         (capture / f"image{index}.png").unlink()
@@ -67,6 +75,7 @@ CASES = [
     ("corrupt image", 3, write("image2.png", b"\x89PNG\r\n\x1a\nrubbish")),
     ("truncated image", 3, truncate),
     ("not an image", 3, write("image2.png", b"text")),
+    ("images without pixels", 3, without_pixels),
     ("images of different sizes", 3, write("image2.png", np.ones((24, 25), np.uint16))),
     ("mask of another size", 3, write("mask.png", np.full((20, 24), 255, np.uint8))),
     ("mask all zero", 3, write("mask.png", np.zeros((24, 24), np.uint8))),
@@ -132,6 +141,20 @@ def test_usage_errors(run, golden):
     told = [run(line, code=2, out="").err for line in USAGE_ERRORS[1:].split("\n")]
     assert [message.count("\n") for message in told] == [1] * len(told)
     golden("usage_errors.txt", "".join(told))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows keeps the folder")
+@pytest.mark.parametrize(
+    "arguments",
+    ["infer {} --method ls -o .", "integrate {} -o .", "info {} --json", "prepare -o s"],
+)
+def test_a_current_folder_that_was_removed(arguments, capture, run, tmp_path, monkeypatch):
+    """A file cannot be created in it, although the folder exists for the system."""
+    (tmp_path / "removed").mkdir()
+    monkeypatch.chdir(tmp_path / "removed")
+    (tmp_path / "removed").rmdir()
+    message = "splinecli: the current folder was removed. Change to another folder.\n"
+    run(arguments.format(tmp_path / capture), code=2, err=message)
 
 
 @pytest.mark.parametrize("option", ["--crosstalk", "--mask", "--output"])

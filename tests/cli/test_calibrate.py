@@ -139,6 +139,8 @@ def test_refusals(refuse):
         write_image(path, read_image(path)[:, 35:])
     write_gray(Path("gray"), [1, 1, 0, 1])
     Path("empty").mkdir()
+    Path("nothing").mkdir()
+    Path("nothing/0.pgm").write_bytes(b"P5\n0 0\n255\n")
     Path("done").mkdir()
     Path("done/calibration.png").touch()
     cases = """
@@ -149,6 +151,8 @@ def test_refusals(refuse):
         2 ball --gray-ball gray --gray-card gray
         3 missing
         3 empty
+        3 nothing
+        3 ball --mask nothing/0.pgm
         3 flat
         3 cut
         3 dark --circle 60,48,40

@@ -3,6 +3,7 @@ exact.
 """
 
 import json
+import tracemalloc
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -195,6 +196,27 @@ def test_pixels_that_an_image_lacks_are_not_common() -> None:
     assert common.tolist() == [[False] * 6, *[[True] * 4 + [False] * 2] * 3]
 
 
+@pytest.mark.parametrize(
+    ("work", "most"),
+    [
+        # the nearest pixels in two bytes, and the interpolated ones in four
+        (lambda image, motion: resample(image, image.astype(np.float32), motion), 6 + 4),
+        (lambda image, motion: common_pixels(motion[None], image.shape[:2]), 1),
+    ],
+)
+def test_whole_images_take_no_memory_but_for_their_values(
+    work: Callable[[Any, Floats], object], most: int
+) -> None:
+    """The memory of a capture is checked before it is read, without the places of its pixels."""
+    image, motion = np.ones((1000, 1000, 1), np.uint16), np.eye(3)
+    motion[:2, 2] = 1.5, -0.5
+    tracemalloc.start()
+    work(image, motion)
+    taken = tracemalloc.get_traced_memory()[1] / image.size
+    tracemalloc.stop()
+    assert taken < most + 5
+
+
 @pytest.fixture
 def write_moved(tmp_path: Path) -> Iterator[Callable[..., Path]]:
     def write(spoilt: bool = False, pixels: float = 3.0) -> Path:
@@ -245,6 +267,11 @@ def test_captures_that_cannot_be_aligned_are_refused(
     for options in ({"light_indices": (0, 1, 2, 3)}, {"n_lights": 4}):
         with pytest.raises(UsageError, match="leaves 4 images, but --align needs at least 5"):
             infer(write_moved(), tmp_path, **options)
+    for crop, size in (("60,60,30,1", "30 x 1"), ("60,60,1,30", "1 x 30"), ("60,60,1,1", "1 x 1")):
+        with pytest.raises(
+            InputError, match=f"found an object of {size} pixels, expected .* 8 x 8"
+        ):
+            infer(write_moved(), tmp_path, crop=crop)
 
 
 def test_large_captures_are_reduced(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -102,13 +102,23 @@ def test_films_are_complete_when_they_no_longer_change(tmp_path):
     assert arrivals.take() == []
 
 
-def test_captures_of_one_name_come_one_after_the_other(tmp_path):
-    """Together they would end the batch."""
-    arrivals = Arrivals(tmp_path, marker=None, seconds=0, without=tmp_path / "out")
-    for name in ("clip.mp4", "clip/1.png"):
-        put(tmp_path / name)
+@pytest.mark.parametrize("names", [("clip.mp4", "clip/1.png"), ("in/1.png", "images/1.png")])
+def test_captures_of_one_name_come_one_after_the_other(tmp_path, names):
+    """Together they would end the batch. Results of a folder `images` have its parent's name."""
+    arrivals = Arrivals(tmp_path / "in", marker=None, seconds=0, without=tmp_path / "out")
+    for name in names:
+        put(tmp_path / "in" / name)
     found = [arrivals.take() for _ in range(3)]
     assert [len(paths) for paths in found] == [1, 1, 0] and found[0] != found[1]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX links")
+def test_links_to_themselves_are_passed_over(tmp_path):
+    arrivals = Arrivals(tmp_path, marker=None, seconds=0, without=tmp_path / "out")
+    put(tmp_path / "part/1.png")
+    for name in ("loop", "loop.mp4"):
+        (tmp_path / name).symlink_to(name)
+    assert arrivals.take() == [tmp_path / "part"]
 
 
 def test_a_folder_that_vanishes_for_a_moment(tmp_path):

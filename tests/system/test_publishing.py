@@ -324,3 +324,16 @@ def test_folders_made_for_nothing_go_again(tmp_path, monkeypatch):
 def test_json_that_cannot_be_used_is_a_value_error(text):
     with pytest.raises(ValueError):
         parse_json(text)
+
+
+def test_equal_files_are_compared_with_one_of_each_group(tmp_path, monkeypatch):
+    """All pairs of hundreds of copies would take half a minute."""
+    paths = [tmp_path / str(number) for number in range(60)]
+    for number, path in enumerate(paths):
+        path.write_bytes(b"ab"[number % 2 : number % 2 + 1] + bytes(9999))
+    paths[9].write_bytes(b"a")
+    read = Mock(wraps=files.file_sha256)
+    monkeypatch.setattr(files, "file_sha256", read)
+    found = files.equal_files(paths)
+    assert read.call_count == 59
+    assert found == [(n % 2, n) for n in range(2, 60) if n != 9]

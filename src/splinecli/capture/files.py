@@ -126,20 +126,20 @@ def copies(images: Sequence[Path]) -> list[CaptureWarning]:
     """Say which images were left out because another file of the same stem shows the same
     photograph.
     """
-    images = [page_of(image)[0] for image in images]
-    stems = {image.stem.lower() for image in images}
+    stored = {page_of(image)[0] for image in images}
+    stems = {image.stem.lower() for image in stored}
     others = [
         entry
-        for folder in {image.parent for image in images}
+        for folder in {image.parent for image in stored}
         for entry in list_folder(folder)
         if entry.suffix.lower() in IMAGE_SUFFIXES
         and entry.stem.lower() in stems
-        and entry not in images
+        and entry not in stored
     ]
     if not others:
         return []
     kinds, used = (
-        ", ".join(sorted({path.suffix.lower() for path in paths})) for paths in (others, images)
+        ", ".join(sorted({path.suffix.lower() for path in paths})) for paths in (others, stored)
     )
     text = (
         f"{len(others)} files ({kinds}) have the names of other images ({used}): they show the"

@@ -212,6 +212,9 @@ _XML = re.compile(
 )
 
 
+_MOST_NAMED = 6  # matrices in a message
+
+
 def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     """Read the rows of the matrix of lights in a file of NumPy, MATLAB or OpenCV; the lines count
     them from 1.
@@ -220,9 +223,12 @@ def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     numbers.check_text_length(path, numbers.MOST_TEXT)
     if suffix == ".npy":
         array = _read_npy(path)
+    elif suffix == ".mat":
+        array = numbers.read_matrix(path, lambda shapes: _choose(shapes, path, n_images))
     else:
-        read = numbers.read_matrices if suffix == ".mat" else _read_opencv
-        array = _choose(read(path), path, n_images)
+        matrices = _read_opencv(path)
+        shapes = {name: matrix.shape for name, matrix in matrices.items()}
+        array = matrices[_choose(shapes, path, n_images)]
     is_matrix = array.ndim == 2 and array.dtype.kind in "fiu" and array.size
     if not is_matrix or not np.isfinite(array).all():
         raise InputError(
@@ -234,20 +240,24 @@ def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     return NumberRows(path, tuple(NumberRow(tuple(row), line) for line, row in rows))
 
 
-def _choose(matrices: Mapping[str, Float64Array], path: Path, n_images: int | None) -> Float64Array:
-    """Return the matrix N x 3 or 3 x N, of several the one that has a light for each image."""
-    lights = {name: m for name, m in matrices.items() if m.ndim == 2 and 3 in m.shape}
+def _choose(shapes: Mapping[str, tuple[int, ...]], path: Path, n_images: int | None) -> str:
+    """Return the name of the matrix N x 3 or 3 x N, of several the one that has a light for each
+    image.
+    """
+    lights = {name: shape for name, shape in shapes.items() if len(shape) == 2 and 3 in shape}
     if len(lights) > 1:
         usual = (n_images, 3), (3, n_images)
-        lights = {name: m for name, m in lights.items() if m.shape in usual} or lights
+        lights = {name: shape for name, shape in lights.items() if shape in usual} or lights
     if len(lights) == 1:
-        return next(iter(lights.values()))
-    sizes = ", ".join(
-        f"{name} ({' x '.join(map(str, m.shape))})" for name, m in (lights or matrices).items()
-    )
+        return next(iter(lights))
+    sizes = [
+        f"{name} ({' x '.join(map(str, shape))})" for name, shape in (lights or shapes).items()
+    ]
+    named = ", ".join(sizes[:_MOST_NAMED])
+    more = f" and {len(sizes) - _MOST_NAMED} more" if len(sizes) > _MOST_NAMED else ""
     raise InputError(
         f"found {'several matrices' if lights else 'no matrix'} N x 3 or 3 x"
-        f" N{f': {sizes}' if sizes else ''}",
+        f" N{f': {named}{more}' if sizes else ''}",
         path,
         hint="Write the light directions into a text file, a line x y z for each image",
     )

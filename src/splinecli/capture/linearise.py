@@ -210,7 +210,6 @@ def take_around(image: Array, around: Bools) -> Array:
 def pixel_reader(
     radiometry: RadiometricCalibration,
     mask: Bools,
-    n_images: int,
     like: str,
     window: Window,
     wanted: Integers | slice = EVERY_PIXEL,
@@ -222,17 +221,12 @@ def pixel_reader(
     The linear values cover only the `wanted` pixels, or all pixels followed by the pixels of the
     mask `around` (H, W).
 
-    The ambient image and a common flat field are read now, once. Both functions raise InputError
-    for an unreadable image, this one also for a wrong number of flat fields. Messages name `like`
-    as the image of the expected size.
+    The ambient image and a common flat field are read now, once; of several, each image has its
+    own. Both functions raise InputError for an unreadable image. Messages name `like` as the image
+    of the expected size.
     """
     flats = radiometry.flat_field
     ambient: Float32Array | None = None
-    if len(flats) not in (0, 1, n_images):
-        problem = (
-            f"found {len(flats)} flat-field images, expected 1 or {n_images}, one for each image"
-        )
-        raise InputError(problem, path=flats[0].parent)
 
     def pixels(
         path: Path, like: str = "the other images", wanted: Integers | slice = EVERY_PIXEL

@@ -113,8 +113,12 @@ def open_capture(folder: StrPath, options: CaptureOptions = CaptureOptions()) ->
     in_folder = files.images
     files, directions, intensities, warnings = _read_all_lights(files, options, form, channels)
     warnings += files.warnings
-    if len(radiometry.flat_field) == len(in_folder) > 1:  # in the order of the folder's images
-        flat_of = dict(zip(in_folder, radiometry.flat_field, strict=True))
+    if len(flats := radiometry.flat_field) > 1:  # in the order of the folder's images
+        each = tuple(dict.fromkeys(in_folder))  # those with three lights once
+        if len(flats) != len(each):
+            problem = f"found {len(flats)} flat-field images, expected 1 or {len(each)}"
+            raise InputError(f"{problem}, one for each image", path=flats[0].parent)
+        flat_of = dict(zip(each, flats, strict=True))
         radiometry = replace(radiometry, flat_field=tuple(flat_of[image] for image in files.images))
     if options.are_equal:
         intensities = None

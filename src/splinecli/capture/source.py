@@ -360,9 +360,7 @@ class CaptureSource(Source):
         Raises InputError if an image cannot be read, or does not have the size of the mask.
         """
         like = self.files.images[indices[0]].name
-        pixels_of = linearise.pixel_reader(
-            self.radiometry, mask, len(self.facts), like, self.window, wanted, around
-        )
+        pixels_of = linearise.pixel_reader(self.radiometry, mask, like, self.window, wanted, around)
         if self.alignment is not None:
             pixels_of = self._aligned_reader(self.alignment.transforms, mask, like, wanted, around)
 
@@ -390,7 +388,7 @@ class CaptureSource(Source):
         """Return a reader like pixel_reader's, of images that are moved back as a whole."""
         whole = np.ones(self.facts[0].size[0][:2], np.bool_)
         read = linearise.pixel_reader(
-            self.radiometry, whole, len(self.facts), like, replace(self.window, box=None, step=1)
+            self.radiometry, whole, like, replace(self.window, box=None, step=1)
         )
 
         def pixels(path: Path, index: int) -> tuple[Array, Float32Array]:

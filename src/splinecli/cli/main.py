@@ -43,6 +43,7 @@ from splinecli.cli.console import (
 )
 from splinecli.cli.infer import infer, info, watch
 from splinecli.cli.signals import INTERRUPTED, TOLD
+from splinecli.errors import UsageError
 from splinecli.records.base import (
     PANELS,
     Option,
@@ -204,6 +205,11 @@ class Command(TyperCommand):
         ctx.params = {name: _expand(value) for name, value in ctx.params.items()}
 
         def run() -> Any:
+            try:
+                Path.cwd()
+            except FileNotFoundError:
+                problem = "the current folder was removed"
+                raise UsageError(problem, hint="Change to another folder") from None
             try:
                 return super(Command, self).invoke(ctx)
             except EOFError as error:  # click would treat it as an interruption by the user

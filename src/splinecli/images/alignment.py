@@ -19,6 +19,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Floats
+from splinecli.maths.pixel_grid import slices
 from splinecli.maths.robust import inverse_3x3
 
 Model = Literal["translation", "similarity", "homography"]
@@ -54,6 +55,8 @@ _SMALLEST_SIDE, _SIDE_OF_FIRST = (
     20,
     128,
 )
+# whose places are computed at a time: those of a whole image would take 60 bytes a pixel
+_ROWS = 32
 _NEIGHBOURS = 8  # images with similar lights that each image is compared with for its first shift
 _HIGH_PASS, _LOW_PASS = 3.0, 0.7  # standard deviations in pixels
 _MOST_OBSERVATIONS = 600_000  # on a level
@@ -160,12 +163,19 @@ def _described(
 def common_pixels(transforms: Float64Array, shape: Sequence[int]) -> Bools:
     """Return which pixels (H, W) of the reference are inside all images of this shape (H, W)."""
     height, width = shape
-    rows, columns = np.arange(height, dtype=np.float64)[:, None], np.arange(width, dtype=np.float64)
     common = np.ones((height, width), np.bool_)
-    for row_x, row_y, row_w in transforms:
-        x, y, w = (row[0] * columns + row[1] * rows + row[2] for row in (row_x, row_y, row_w))
-        common &= (w > 0) & (x >= 0) & (x <= (width - 1) * w) & (y >= 0) & (y <= (height - 1) * w)
+    for rows in slices(height, _ROWS):
+        for transform in transforms:
+            x, y, w = _points(transform, rows, (height, width))
+            inside = (x >= 0) & (x <= (width - 1) * w) & (y >= 0) & (y <= (height - 1) * w)
+            common[rows] &= inside & (w > 0)
     return common
+
+
+def _points(transform: Float64Array, rows: slice, shape: tuple[int, int]) -> list[Float64Array]:
+    """Return the places of the pixels of some rows in another image, as homogeneous x, y and w."""
+    y, x = np.arange(*rows.indices(shape[0]))[:, None], np.arange(shape[1])
+    return [row[0] * x + row[1] * y + row[2] for row in transform]
 
 
 def resample(
@@ -186,14 +196,15 @@ def resample(
     moved = cv2.warpPerspective(
         linear, transform, size, flags=flags, borderMode=cv2.BORDER_REPLICATE
     )
-    there = transform @ np.stack(
-        (*np.meshgrid(np.arange(width), np.arange(height)), np.ones((height, width))), 1
-    )
-    columns, rows = (
-        np.rint(axis / there[:, 2]).astype(np.intp) for axis in (there[:, 0], there[:, 1])
-    )
-    nearest = stored[rows.clip(0, height - 1), columns.clip(0, width - 1)]
-    return nearest, np.maximum(moved, 0).reshape(linear.shape)
+    nearest = np.empty_like(stored)
+    for rows in slices(height, _ROWS):
+        x, y, w = _points(transform, rows, (height, width))
+        places = (np.rint(axis / w).astype(np.intp) for axis in (y, x))
+        row, column = (
+            each.clip(0, side - 1) for each, side in zip(places, (height, width), strict=True)
+        )
+        nearest[rows] = stored[row, column]
+    return nearest, np.maximum(moved, 0, out=moved).reshape(linear.shape)
 
 
 @dataclass(frozen=True, eq=False)

@@ -510,16 +510,17 @@ def light_spread(light_directions: Float64Array) -> tuple[float, bool]:
 
 
 def repeated_images(observations: Floats) -> list[tuple[int, int]]:
-    """Return the pairs of images among observations (P, F) that are equal up to a scale, and not
-    uniform.
+    """Return the first image and each later one among observations (P, F) that are equal up to a
+    scale, and not uniform.
     """
     values = observations.astype(np.float64)
     values = values / np.maximum(np.linalg.norm(values, axis=0), 1e-300)
     varied = np.ptp(values, axis=0) > 0
     # One minus the cosine between two images that are the same, up to rounding. Noise gives 1e-6
     # and more.
-    same = (1 - values.T @ values < 1e-12) & varied & varied[:, None]
-    return [(int(first), int(second)) for first, second in np.argwhere(np.triu(same, 1))]
+    same = (1 - values.T @ values < 1e-12) & varied[:, None]
+    pairs = zip(same.argmax(axis=0).tolist(), range(len(same)), strict=True)
+    return [(first, second) for first, second in pairs if first < second and varied[second]]
 
 
 def check_confidence(expected_under_5: float | None) -> list[CaptureWarning]:

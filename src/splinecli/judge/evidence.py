@@ -23,7 +23,7 @@ from splinecli.judge.explanations import (
     Kind,
     constant_light,
 )
-from splinecli.judge.judge_net import CLASSES, RIGHT, features_of, judge_net
+from splinecli.judge.judge_net import CLASSES, RIGHT, TRANSLUCENT, features_of, judge_net
 from splinecli.judge.light_check import LightCheck, check_lights
 from splinecli.judge.odd_images import ImageShift, find_shifts
 from splinecli.judge.shading_shifts import moved_back, shading_shifts
@@ -193,7 +193,7 @@ class Evidence:
         if not kinds:
             return None
         best, *others = sorted(kinds, key=lambda kind: -shares[kind])
-        if shares[best] < shares[RIGHT]:
+        if shares[best] < max(shares[RIGHT], shares[TRANSLUCENT]):
             return None
         total = float(sum(shares[kind] for kind in kinds))
         # Explanations that are this likely, compared with the likeliest one, are named beside it.

@@ -14,12 +14,13 @@ from pathlib import Path
 
 from msgspec import Struct, to_builtins
 
+from splinecli.capture import capture_name
 from splinecli.capture.files import digest, natural_key, stamp_content
 from splinecli.capture.formats.film import FEWEST_FRAMES, choose_frames, is_film, read_frames
 from splinecli.errors import InputError, OutputError, UsageError
 from splinecli.pictures.maps import encode_png
 from splinecli.pipeline.infer_options import ReadingOptions, Redo
-from splinecli.system.files import read_json
+from splinecli.system.files import is_folder, read_json
 from splinecli.system.progress import Observer
 from splinecli.system.publishing import held_folder, is_plain, new_files, refuse_link
 
@@ -176,23 +177,24 @@ class Arrivals:
             unchanged = now - seen.since >= self.seconds
             by_time = self.marker is None or is_film(path)
             complete = unchanged if by_time else os.path.exists(path / str(self.marker))  # noqa: PTH110 - never raises
-            name = path.stem if is_film(path) else path.name
+            name = path.name
+            with suppress(InputError):  # reading the capture will raise it again
+                name = capture_name(path)
             seen.returned = complete and ready.setdefault(name, path) is path
         return sorted(ready.values(), key=natural_key)
 
     def _captures(self) -> list[Path]:
         try:
             with os.scandir(self.folder) as entries:
-                visible = [
-                    (entry.is_dir(), Path(entry.path)) for entry in entries if entry.name[0] != "."
-                ]
+                visible = [Path(entry.path) for entry in entries if entry.name[0] != "."]
         except OSError as error:
             self._seen.clear()  # a capture that was being read has failed and must be retried
             raise InputError(
                 f"the folder cannot be read ({error.strerror})", path=self.folder
             ) from error
-        paths = [path for is_dir, path in visible if is_dir or is_film(path)]
-        return [path for path in paths if path.resolve() not in self._left_out]
+        paths = [path for path in visible if is_folder(path) or is_film(path)]
+        # Path.resolve raises for a link to itself.
+        return [path for path in paths if Path(os.path.realpath(path)) not in self._left_out]
 
 
 def _changed(folder: str) -> int:

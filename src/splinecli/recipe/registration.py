@@ -27,6 +27,7 @@ from splinecli.recipe.reading import compared_pixels
 from splinecli.recipe.work import Work
 from splinecli.records.capture_warnings import IMAGES_ALIGNED, CaptureWarning
 
+LEAST_SIDE = 8  # of the object, in pixels of the reduced images; the filters reach as far
 LEAST_COMMON = 0.25  # share of the object that all aligned images must show
 
 
@@ -66,10 +67,19 @@ def register(work: Work, advance: Callable[[], object]) -> Work:
         colours, _ = compare_colours(source, indices, lambda: None)
         seen = source.divided_by(indices, colours)
     stride = stride_for(len(indices) * mask.size)
+    small = reduced(mask.astype(np.float32), stride) > 0.5
+    height, width = (np.ptp(each) + 1 if each.size else 0 for each in np.nonzero(small))
+    if min(height, width) < LEAST_SIDE:
+        problem = (
+            f"--align compares details: found an object of {stride * width} x {stride * height}"
+            f" pixels, expected at least {stride * LEAST_SIDE} x {stride * LEAST_SIDE}"
+        )
+        hint = "Read a larger part of the images, or leave --align out"
+        raise InputError(problem, path=folder, hint=hint)
     read = seen.read_pixels(np.ones_like(mask), indices, StoredPixels.observe, advance)
     images = np.stack([reduced(image.reshape(mask.shape), stride) for image in read])
     lights = None if work.options.finds_lights else source.light_directions[indices]
-    found = align_images(images, reduced(mask.astype(np.float32), stride) > 0.5, lights)
+    found = align_images(images, small, lights)
     _check_explained(found, names, source, stride)
     left, top, *_ = source.window.box or (0, 0)
     transforms = np.repeat(np.eye(3)[None], source.n_lights, axis=0)

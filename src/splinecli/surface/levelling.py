@@ -28,7 +28,7 @@ def plane_slopes(
         aspect: height of a pixel in widths, the unit of the heights.
 
     Raises:
-        UsageError: a point is not on the object, or the points are on one line.
+        UsageError: a point is not on the object, or the points or pixels are on one line.
     """
     if points:
         values = []
@@ -46,10 +46,10 @@ def plane_slopes(
     x, y = columns - columns.mean(), (rows.mean() - rows) * aspect
     terms = np.stack((x, y, np.ones(len(z))), axis=1)
     sizes = np.linalg.svd(terms[:, :2], compute_uv=False)
-    if sizes[-1] < 1e-2 * sizes[0]:
-        raise UsageError(
-            "the points of --level are in a line", hint="Choose points that span a plane"
-        )
+    if sizes[-1] <= 1e-2 * sizes[0]:  # both are 0 for a single point
+        what = "points of --level" if points else "pixels of the object"
+        hint = "Choose points that span a plane" if points else "Leave --level out"
+        raise UsageError(f"the {what} are in a line", hint=hint)
     weights, plane = np.ones(len(z)), np.zeros(3)
     for _ in range(1 if points else _FITS):
         weighted = terms * weights[:, None]

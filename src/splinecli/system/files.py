@@ -1,7 +1,6 @@
 """Files: queries about paths, and output files that appear complete or not at all."""
 
 import errno
-import filecmp
 import hashlib
 import itertools
 import json
@@ -36,7 +35,8 @@ def file_sha256(path: Path) -> str:
 
 
 def equal_files(paths: Sequence[Path]) -> list[tuple[int, int]]:
-    """Return the pairs of places in `paths` whose files have the same content. Raises OSError.
+    """Return the places in `paths` of the first file with the same content, and of each file that
+    has an earlier one. Raises OSError.
 
     Only files of equal size are opened.
     """
@@ -48,12 +48,10 @@ def equal_files(paths: Sequence[Path]) -> list[tuple[int, int]]:
             with path.open("rb") as file:
                 file.seek(size // 2)  # the first rows of many images are black
                 alike[size, file.read(1 << 12)].append(place)
-    pairs = itertools.chain.from_iterable(
-        itertools.combinations(places, 2) for places in alike.values()
-    )
-    return [
-        (one, other) for one, other in pairs if filecmp.cmp(paths[one], paths[other], shallow=False)
-    ]
+    several = [place for places in alike.values() if len(places) > 1 for place in places]
+    first: dict[str, int] = {}
+    pairs = [(first.setdefault(file_sha256(paths[place]), place), place) for place in several]
+    return [(one, other) for one, other in pairs if one != other]
 
 
 def expanded(path: str) -> Path:

@@ -7,6 +7,7 @@ Pillow.
 
 import struct
 import zlib
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,7 +22,9 @@ from splinecli.capture import CaptureOptions, open_capture, read_image, read_mas
 from splinecli.capture.formats.facts import (
     UPRIGHT,
     Exposure,
+    ImageHeader,
     common_orientation,
+    exposure_factors,
     find_exposure,
     read_header,
 )
@@ -295,6 +298,13 @@ def test_reading(tmp_path):
             1 / 60, 8.0, 100
         )
         assert find_exposure(read_header(write(tmp_path / f"b.{suffix}", None))) is None
+
+
+@pytest.mark.parametrize("shot", [(1e-300, 8, 100), (0.1, 1e200, 100), (0.1, 8, 1e300)])
+def test_exposures_that_no_camera_has_are_ignored(shot):
+    """EXIF may store them as doubles."""
+    facts = ImageHeader(Path("a.tif"), exif=dict(zip((0x829A, 0x829D, 0x8827), shot, strict=True)))
+    assert find_exposure(facts) is None and exposure_factors([facts, facts]) is None
 
 
 def test_mixed_exposures_are_divided_out(tmp_path):

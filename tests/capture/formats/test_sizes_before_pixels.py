@@ -9,17 +9,24 @@ import struct
 import sys
 import zlib
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
+import tifffile
 from scipy.io import savemat
 
 from scenes import png_chunk, write_image
 from splinecli.capture import open_capture
+from splinecli.capture.formats import decoders
 from splinecli.capture.formats.facts import read_header
-from splinecli.capture.formats.images import check_stored_size, decode_image
-from splinecli.capture.formats.normal_files import read_ground_truth, read_normal_map
+from splinecli.capture.formats.images import ExpectedSize, check_stored_size, decode_image
+from splinecli.capture.formats.normal_files import (
+    read_depth,
+    read_ground_truth,
+    read_normal_map,
+)
 from splinecli.capture.light_files import read_light_directions
 from splinecli.errors import InputError
 from splinecli.lights.calibration.balls import calibrate_ball, find_ball_files
@@ -259,6 +266,26 @@ def test_a_picture_with_gigabytes_behind_it(tmp_path):
         )
 
 
+def test_the_pages_of_a_long_tiff(tmp_path, monkeypatch):
+    """Of each page only its parts are read, and the pages are found once: together they would take
+    time in the square of their number.
+    """
+    pictures = [np.full(SMALL, 9 * number, np.uint16) for number in range(20)]
+    tifffile.imwrite(tmp_path / "plain.tif", np.array(pictures), photometric="minisblack")
+    cv2.imwritemulti(str(tmp_path / "packed.tif"), pictures)  # LZW, which only OpenCV decodes
+    for name in ("plain.tif", "packed.tif"):
+        with (tmp_path / name).open("ab") as file:
+            file.truncate(1 << 31)
+        listed = decoders.pages(tmp_path / name)
+        assert len(listed) == 20
+        walk = Mock(wraps=decoders._places)
+        monkeypatch.setattr(decoders, "_places", walk)
+        for page, picture in zip(listed, pictures, strict=True):
+            assert np.array_equal(decode_image(page)[..., 0], picture)
+        assert walk.call_count < 5  # those of the first page are not searched
+        assert growth(lambda listed=listed: [decode_image(page) for page in listed]) < MOST_GROWTH
+
+
 def test_light_files_with_too_much_text(tmp_path):
     for text, message in (
         ("0 0 1" + " " * 1_000_000, "found 1.0 MB, expected a text file of at most 1.0"),
@@ -267,6 +294,35 @@ def test_light_files_with_too_much_text(tmp_path):
     ):
         (tmp_path / "a.txt").write_text(text)
         refused(lambda: read_light_directions(tmp_path / "a.txt"), message)
+
+
+def test_matrices_of_which_none_can_be_the_lights(tmp_path):
+    """A hundred that expand to 8 MB each."""
+    content, rows = b" " * 124 + b"\0\1IM", 1 << 18
+    for number in range(100):
+        matrix = struct.pack("<IIII", 6, 8, 6, 0) + struct.pack("<IIII", 5, 8, rows, 3)
+        matrix += struct.pack("<HH", 1, 3) + b"m%02d\0" % number
+        matrix += struct.pack("<II", 2, 3 * rows) + bytes(3 * rows)
+        packed = zlib.compress(struct.pack("<II", 14, len(matrix)) + matrix)
+        content += struct.pack("<II", 15, len(packed)) + packed
+    (tmp_path / "lights.mat").write_bytes(content)
+    message = r"found several matrices N x 3 or 3 x N: m00 \(262144 x 3\), .* and 94 more"
+    refused(lambda: read_light_directions(tmp_path / "lights.mat", 8), message)
+
+
+def test_a_depth_with_a_thousand_channels(tmp_path):
+    library = pytest.importorskip("OpenEXR")
+    depth, header = np.zeros((300, 300), np.float32), {"compression": library.ZIP_COMPRESSION}
+    channels = {f"c{number}": depth for number in range(1000)}
+    library.File(header, channels).write(str(tmp_path / "a.exr"))
+    parts = [
+        library.Part({"name": name}, {"Z": depth, name: depth}) for name in map(str, range(150))
+    ]
+    library.File(parts).write(str(tmp_path / "parts.exr"))
+    size = ExpectedSize(depth.shape, "the normal map")
+    for name, count in (("a.exr", 1000), ("parts.exr", 300)):
+        message = f"found {count} channels, expected at most 256. Save the depth alone"
+        refused(lambda name=name: read_depth(tmp_path / name, size), message)
 
 
 def test_an_image_larger_than_the_memory(monkeypatch):

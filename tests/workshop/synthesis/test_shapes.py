@@ -220,6 +220,15 @@ def test_the_wider_side_fits_and_the_shape_is_kept():
     assert_allclose(mesh.vertices.min(axis=0), -mesh.vertices.max(axis=0), atol=1e-6)
 
 
+def test_a_mesh_far_from_the_origin_keeps_its_place(tmp_path):
+    """In float32, its corners would lie on a grid as wide as itself."""
+    box = trimesh.creation.box((4.0, 1.0, 2.0)).apply_translation((1e8, -1e8, 1e8))
+    (tmp_path / "far.obj").write_text(trimesh.exchange.obj.export_obj(box, digits=8))
+    mesh = read_mesh(tmp_path / "far.obj")
+    assert_allclose(mesh.vertices.max(axis=0), REACH * np.array((1, 0.25, 0.5)), rtol=1e-5)
+    assert_allclose(mesh.vertices.min(axis=0), -mesh.vertices.max(axis=0), atol=1e-6)
+
+
 def test_a_ball_inside_out_is_turned(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=3)
     ball.invert()
@@ -262,6 +271,12 @@ def test_what_is_no_mesh_is_refused_with_the_reason(tmp_path):
         (
             "needle.obj",
             "v 0 0 0\nv 0 0 1\nv 0 0 2\nf 1 2 3\n",
+            "no extent that a camera along -z could see",
+        ),
+        # Enlarged to fill the image, it would be infinitely deep.
+        (
+            "pole.obj",
+            "v 0 0 0\nv 1e-39 0 1\nv 0 1e-39 2\nf 1 2 3\n",
             "no extent that a camera along -z could see",
         ),
     ):

@@ -120,6 +120,7 @@ def test_files_that_cannot_be_read(tmp_path):
     for name, content, message in (
         ("a.json", b"{", r"a\.json: is not JSON"),
         ("a.json", b"[1]", r"a\.json: is not a table of settings"),
+        ("a.toml", b"\na" + b".a" * 40_000 + b" = 1", r"a\.toml:2: found 40000 points in a line"),
         ("b.toml", b"preset = '\xff'", r"b\.toml: the file is not UTF-8 text"),
     ):
         (tmp_path / name).write_bytes(content)

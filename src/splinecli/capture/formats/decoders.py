@@ -9,11 +9,13 @@ import logging
 import math
 import os
 import re
+import struct
 import sys
 import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal
@@ -133,6 +135,7 @@ def decode_tiff(file: BinaryIO, path: Path) -> Array | None:
     return pixels
 
 
+_MOST_PAGES = 10_000  # of a TIFF file whose pages are images
 _PAGE = re.compile(r"(.+\.tiff?)\[(\d{1,4})\]", re.IGNORECASE)
 
 
@@ -153,7 +156,7 @@ def pages(path: Path) -> list[Path]:
             count = len(page.parent.pages)
     except (InputError, OSError):
         return [path]
-    if not 1 < count < 10_000:
+    if not 1 < count < _MOST_PAGES:
         return [path]
     return [path.with_name(f"{path.name}[{number}]") for number in range(count)]
 
@@ -169,36 +172,90 @@ def first_page(file: BinaryIO, path: Path) -> Iterator[Any]:
     before, logger.disabled = logger.disabled, True  # our error says all that a user needs
     try:
         with damage_as_input_error(path, "the TIFF is damaged and cannot be read", COPY_AGAIN):
-            number = page_of(path)[1]
-            _check_tags(file, number)
+            stored, number = page_of(path)
+            if number:
+                stamp = os.fstat(file.fileno())
+                place = _all_places(stored.absolute(), stamp.st_size, stamp.st_mtime_ns)[number]
+            else:
+                place = next(_places(file))
             file.seek(0)
-            with tifffile.TiffFile(file, name=path.name) as stored:
-                yield stored.pages[number] if number else stored.pages.first
+            with tifffile.TiffFile(file, name=path.name) as tiff:
+                tiff.filehandle.seek(place)
+                yield tifffile.TiffPage(tiff, index=number)
     finally:
         logger.disabled = before
 
 
-def _check_tags(file: BinaryIO, number: int) -> None:
-    """Raise ValueError for a tag with millions of values in a page up to this one: tifffile reads
-    tags as a whole.
+@lru_cache(maxsize=4)
+def _all_places(path: Path, *_: int) -> tuple[int, ...]:
+    """Return what _places yields. It is kept, because each page of a file is opened by itself."""
+    with path.open("rb") as file:
+        return tuple(_places(file))
+
+
+def _places(file: BinaryIO) -> Iterator[int]:
+    """Yield the places of the pages in an open TIFF file.
+
+    Raises ValueError for too many tags, or for a tag with millions of values, because tifffile
+    reads tags as a whole.
     """
     start = file.read(16)
     order: Literal["little", "big"] = "little" if start[:1] == b"I" else "big"
     big = 43 in start[2:4]  # BigTIFF has wider numbers
     bytes_of, length, entry = (8, 8, 20) if big else (4, 2, 12)
     following = start[8:16] if big else start[4:8]
-    for _ in range(number + 1):
-        file.seek(int.from_bytes(following, order))
-        count = int.from_bytes(file.read(length), order)
-        entries = file.read(min(count, 1 << 16) * entry)
-        for place in range(0, len(entries), entry):
-            tag = int.from_bytes(entries[place : place + 2], order)
-            values = int.from_bytes(entries[place + 4 : place + 4 + bytes_of], order)
+    total = 0
+    for _ in range(_MOST_PAGES):
+        place = int.from_bytes(following, order)
+        if place == 0:
+            return
+        file.seek(place)
+        total += (count := int.from_bytes(file.read(length), order))
+        if total > 1 << 20:
+            raise ValueError
+        entries = file.read(count * entry)
+        following = file.read(8 if big else 4)
+        for at in range(0, len(entries), entry):
+            tag = int.from_bytes(entries[at : at + 2], order)
+            values = int.from_bytes(entries[at + 4 : at + 4 + bytes_of], order)
             # Tags with one value for each strip or tile; others, such as colour profiles, have
             # more.
             if values > (1 << 18 if tag in (273, 279, 324, 325) else 1 << 24):
                 raise ValueError
-        following = file.read(8 if big else 4)
+        yield place
+
+
+def tiff_content(file: BinaryIO, path: Path) -> bytes | bytearray:
+    """Return the content of an open TIFF file; for one of its pages, of a BigTIFF file with this
+    page alone.
+    """
+    if page_of(path)[0] == path:
+        return file.read()
+
+    def read(start: int, length: int) -> bytes:
+        file.seek(start)
+        return file.read(length)
+
+    def append(data: bytes) -> int:
+        content.extend(data)
+        return len(content) - len(data)
+
+    with first_page(file, path) as page:
+        order, tags = page.parent.byteorder, list(page.tags)
+        content = bytearray(24 + 20 * len(tags) + 8)
+        parts = zip(page.dataoffsets, page.databytecounts, strict=True)
+        places = [append(read(*part)) for part in parts]
+        start = b"II" if order == "<" else b"MM"
+        struct.pack_into(order + "2sHHHQQ", content, 0, start, 43, 8, 0, 16, len(tags))
+        for number, tag in enumerate(tags):
+            kind, value = int(tag.dtype), read(tag.valueoffset, tag.valuebytecount)
+            if tag.code in (273, 324):  # the places of strips or tiles, as numbers of 8 bytes
+                kind, value = 16, struct.pack(f"{order}{len(places)}Q", *places)
+            if len(value) > 8:
+                value = struct.pack(order + "Q", append(value))
+            at = 24 + 20 * number
+            struct.pack_into(order + "HHQ8s", content, at, tag.code, kind, tag.count, value)
+    return content
 
 
 def _decode_page(page: Any) -> Array | None:

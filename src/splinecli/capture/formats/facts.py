@@ -7,7 +7,6 @@ without end. Pillow reads the EXIF tags, and tifffile the tags of TIFF.
 
 from __future__ import annotations
 
-import math
 import re
 import warnings
 import zlib
@@ -55,7 +54,8 @@ _PNM = re.compile(rb"P[56]" + 3 * rb"(?:\s|#[^\n]*\n)+?(\d{1,9})" + rb"\s")
 StoredSize = tuple[tuple[int, ...], int]
 
 ORIENTATION, _EXIF = 0x0112, 0x8769
-_EXPOSURE = (0x829A, 0x829D, 0x8827)  # EXIF tags of exposure time, f-number and ISO sensitivity
+# EXIF tags of exposure time, f-number and ISO sensitivity, and the range that cameras can have
+_EXPOSURE = {0x829A: (1e-6, 1e5), 0x829D: (0.1, 1e3), 0x8827: (1.0, 1e7)}
 # Also those of the focal length; see balls.py
 _KEPT = (*_EXPOSURE, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA402, 0xA403, 0xA405)
 # Most chunks of a PNG before its pixels, or segments of a JPEG before its frame: usually dozens
@@ -368,7 +368,9 @@ class Exposure(NamedTuple):
 
 
 def find_exposure(facts: ImageHeader) -> Exposure | None:
-    """Return the exposure of an image; None if a part of it is missing or the file is damaged."""
+    """Return the exposure of an image; None if a part of it is missing or beyond what cameras have,
+    or the file is damaged.
+    """
     try:
         if facts.exif is None and facts.kind == "RAW":
             numbers: tuple[Any, ...] = decoders.read_shot(facts.path)
@@ -378,7 +380,8 @@ def find_exposure(facts: ImageHeader) -> Exposure | None:
         exposure = Exposure(*(float(n[0] if isinstance(n, tuple) else n) for n in numbers))
     except Exception:  # damaged tags cause a dozen types of errors
         return None
-    return exposure if all(0 < value < math.inf for value in exposure) else None
+    ranges = zip(exposure, _EXPOSURE.values(), strict=True)
+    return exposure if all(least <= value <= most for value, (least, most) in ranges) else None
 
 
 def check_exposures(images: Sequence[ImageHeader]) -> None:

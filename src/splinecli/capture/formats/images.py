@@ -51,11 +51,13 @@ class ExpectedSize:
 def check_stored_size(
     shape: tuple[int, ...], item_bytes: int, path: Path, expected: ExpectedSize | None = None
 ) -> None:
-    """Raise InputError if an image (H, W) or (H, W, C) is not of the expected size, or too large to
-    be read.
+    """Raise InputError if an image (H, W) or (H, W, C) is not of the expected size, has no pixels,
+    or is too large to be read.
     """
     if expected is not None:
         expected.check(shape, path)
+    if 0 in shape[:2]:
+        raise InputError(f"found an image of {_size(shape)} pixels, expected at least one", path)
     n_pixels, n_bytes = math.prod(shape[:2]), image_bytes(shape, item_bytes)
     takes = f"found an image of {_size(shape)} pixels, which takes"
     if n_pixels > LARGEST_IMAGE:
@@ -146,9 +148,10 @@ def decode_with_alpha(
     with damage, facts.open_image(path) as (file, kind):
         size = facts.facts_in(file, kind, path).size
         check_stored_size(*size, path, expected)
-        # It is read as a whole, with 64 MB for previews and colour profiles.
+        # It is read as a whole, with 64 MB for previews and colour profiles; only its page is read
+        # of a TIFF with many.
         length, most = os.fstat(file.fileno()).st_size, image_bytes(*size) + (1 << 26)
-        if length > most:
+        if length > most and decoders.page_of(path)[0] == path:
             raise InputError(
                 f"found {length / 1e6:.1f} MB, expected at most {most / 1e6:.1f} MB for an image"
                 " of this size",
@@ -184,6 +187,7 @@ def _decode(file: BinaryIO, kind: str, path: Path) -> Array:
         if pixels is not None:
             return pixels
         file.seek(0)
+        return _decode_with_opencv(decoders.tiff_content(file, path))
     if kind in facts.PILLOW_KINDS:
         with facts.open_with_pillow(file, kind, path) as picture:
             mode = {"1": "L", "L": "L", "LA": "LA", "RGBA": "RGBA"}.get(picture.mode, "RGB")
@@ -195,14 +199,13 @@ def _decode(file: BinaryIO, kind: str, path: Path) -> Array:
         if len(data) < start + math.prod(shape) * np.dtype(dtype).itemsize:
             raise InputError(f"the {kind} is truncated", path, hint=decoders.COPY_AGAIN)
         return np.frombuffer(data, dtype, math.prod(shape), start).reshape(shape).astype(dtype[-2:])
-    if kind != "TIFF":
-        (_check_png if kind == "PNG" else _check_jpeg)(data, path)
-    return _decode_with_opencv(data, decoders.page_of(path)[1])
+    (_check_png if kind == "PNG" else _check_jpeg)(data, path)
+    return _decode_with_opencv(data)
 
 
-def _decode_with_opencv(data: bytes, page: int) -> Array:
-    """Return a page's pixels (H, W) or (H, W, C), as RGB or RGBA. Raises ValueError or cv2.error
-    for a damaged file.
+def _decode_with_opencv(data: bytes | bytearray) -> Array:
+    """Return pixels (H, W) or (H, W, C), as RGB or RGBA. Raises ValueError or cv2.error for a
+    damaged file.
     """
     import cv2
 
@@ -210,12 +213,7 @@ def _decode_with_opencv(data: bytes, page: int) -> Array:
         try:
             # IMREAD_UNCHANGED keeps 16 bits and the alpha channel, and leaves the EXIF orientation
             # alone.
-            content, pixels = np.frombuffer(data, np.uint8), None
-            if page:
-                _, found = cv2.imdecodemulti(content, cv2.IMREAD_UNCHANGED, range=(page, page + 1))
-                pixels = found[0] if found else None
-            else:
-                pixels = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         except cv2.error as error:
             if error.code == cv2.Error.StsNoMem:
                 raise MemoryError from None

@@ -14,9 +14,11 @@ floating-point .npy, TIFF and OpenEXR files.
 """
 
 import io
+import math
+from collections.abc import Mapping
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,6 +39,7 @@ from splinecli.system.files import StrPath, check_file, utf8_name
 from splinecli.system.machine import import_extra
 
 _LARGEST = 1e100  # values of damaged files may have an infinite square
+_MOST_CHANNELS = 256  # of an EXR file; renderers write up to about a hundred
 _BLOCK = 1 << 20  # pixels scaled at a time: in float64, a large picture would need much memory
 
 
@@ -244,15 +247,30 @@ def read_depth(path: Path, expected: images.ExpectedSize) -> Float64Array:
     return depth
 
 
+def _exr_size(header: Mapping[str, Any]) -> tuple[int, int]:
+    """Return height and width of a part of an EXR file."""
+    low, high = header["dataWindow"]
+    return int(high[1] - low[1] + 1), int(high[0] - low[0] + 1)
+
+
 def _read_exr(path: Path, expected: images.ExpectedSize) -> Array:
     """Return the first channel of an EXR file that may hold a depth."""
     library = import_extra("OpenEXR", "exr")
     with path.open("rb") as file:
         name = utf8_name(path, file)
         with native_stderr():
-            low, high = library.File(name, header_only=True).header()["dataWindow"]
-        shape = int(high[1] - low[1] + 1), int(high[0] - low[0] + 1)
-        images.check_stored_size(shape, 4, path, expected)
+            headers = [part.header for part in library.File(name, header_only=True).parts]
+        # All channels of all parts are read.
+        sizes = [(*_exr_size(header), len(header["channels"])) for header in headers]
+        (height, width, _), n_values = sizes[0], sum(map(math.prod, sizes))
+        n_channels = -(-n_values // (height * width))  # or parts of their size
+        images.check_stored_size((height, width, n_channels), 4, path, expected)
+        if n_channels > _MOST_CHANNELS:
+            raise InputError(
+                f"found {n_channels} channels, expected at most {_MOST_CHANNELS}",
+                path,
+                hint="Save the depth alone",
+            )
         # For damaged pixels, the library only prints a warning, and stdout is reserved for the
         # product of a command.
         with redirect_stdout(io.StringIO()) as printed, native_stderr():

@@ -10,7 +10,7 @@ import math
 import re
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -301,17 +301,21 @@ def read_mat(path: Path, expected: ExpectedSize | None) -> Array:
         return _numbers(file, variable)
 
 
-def read_matrices(path: Path) -> dict[str, Array]:
-    """Return the numeric matrices of a small file by name. Raises InputError."""
+def read_matrix(path: Path, choose: Callable[[dict[str, tuple[int, ...]]], str]) -> Array:
+    """Return the numeric matrix of a small file whose name is chosen from the shapes by name.
+
+    Only this one is expanded. Raises InputError, also those of `choose`.
+    """
     with (
         damage_as_input_error(path, "the .mat file is damaged", "Save it again"),
         path.open("rb") as file,
     ):
-        return {
-            v.name: _numbers(file, v)
-            for v in list(_variables(file, path))
+        found = {
+            v.name: v
+            for v in _variables(file, path)
             if len(v.shape) == 2 and 0 < math.prod(v.shape) <= 1 << 20
         }
+        return _numbers(file, found[choose({name: v.shape for name, v in found.items()})])
 
 
 def _numbers(file: BinaryIO, variable: _Variable) -> Array:

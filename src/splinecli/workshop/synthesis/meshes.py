@@ -24,6 +24,7 @@ from splinecli.system.machine import import_extra, is_out_of_memory
 
 Floats = NDArray[np.floating]
 REACH = 0.94  # half-width of the object in the camera's square
+LEAST_EXTENT = 1e-3  # of a mesh in x and y, as a share of its largest side
 LONGEST_EDGE = 0.03  # of a face; longer ones are split
 MOST_FACES = 2_000_000
 _LONGEST = {"ply": 32_000_000, "obj": 32_000_000, "off": 32_000_000, "stl": 84 + 50 * MOST_FACES}
@@ -91,8 +92,9 @@ def read_mesh(path: str | Path) -> Mesh:
         ) from error
     if not len(faces):
         raise InputError("the mesh has no faces", path=path, hint="Point clouds cannot be rendered")
-    if not np.isfinite(vertices).all() or np.ptp(vertices[:, :2], axis=0).max() == 0:
+    if not np.isfinite(vertices).all() or np.ptp(vertices[:, :2], axis=0).max() < LEAST_EXTENT:
         raise InputError("the mesh has no extent that a camera along -z could see", path=path)
+    vertices = vertices - vertices[:1]  # in float32, places far from the origin are coarse
     mesh = Mesh(vertices.astype(np.float32), faces.astype(np.int32), normals.astype(np.float32))
     return split_long_edges(fit_to_frame(mesh), longest=LONGEST_EDGE)
 

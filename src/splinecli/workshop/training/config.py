@@ -236,6 +236,7 @@ CHANGEABLE = (
     "learning_rate",
     "gradient_limit",
 )
+_MOST_POINTS = 300  # in a line of a TOML file
 # nested settings, as in TrainingConfig.to_dict; only some of them may be given
 Settings = dict[str, Any]
 
@@ -243,7 +244,13 @@ Settings = dict[str, Any]
 def read_config_file(path: Path) -> Settings:
     """Read the settings of a TOML file or of a run's config.json. Raises ModelError."""
     try:
-        text = "\n".join(read_lines(path))
+        lines = read_lines(path)
+        for number, line in enumerate(lines, start=1):
+            # tomllib takes time and memory in the square of a name's length, 6 GB for 80 kB.
+            if path.suffix != ".json" and (count := line.count(".")) > _MOST_POINTS:
+                problem = f"found {count} points in a line, expected at most {_MOST_POINTS}"
+                raise ModelError(problem, path, line=number, hint="Give each setting its own line")
+        text = "\n".join(lines)
         values: Any = parse_json(text) if path.suffix == ".json" else tomllib.loads(text)
     except InputError as error:
         raise ModelError(error.problem, path=path, hint=error.hint) from error
