@@ -93,8 +93,8 @@ def run(folder: Path, options: InferOptions, load: Callable[[], Any]) -> dict[st
 
 
 def as_given(folder: Path, options: InferOptions, load: Callable[[], Any]) -> dict[str, Any]:
-    """Run `infer` without mending."""
-    return run(folder, options.replace(as_stored=False), load)
+    """Run `infer` without mending: values that options give are kept."""
+    return run(folder, options.replace(light_frame="x-right,y-up", transfer="linear"), load)
 
 
 def named_remedies(warnings: Iterable[dict[str, Any]]) -> Iterator[tuple[str, str, list[str]]]:
@@ -154,7 +154,7 @@ class Measured:
         self.name, self.result, self.truth = name, result, result["truth"]
         self.kind: str = self.truth["kind"]
         self.warnings = result.get("warnings", [])
-        self.codes = {each["code"] for each in self.warnings}
+        self.codes = {each["code"] for each in self.warnings} | set(result.get("mended", []))
         self.errors = {each["code"] for each in self.warnings if each["is_error"]}
         if self.truth["degree"] == "unknown":  # the lamps do differ
             self.errors.discard("unequal_intensities")

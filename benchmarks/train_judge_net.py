@@ -43,6 +43,7 @@ Array = NDArray[np.float64]
 SHAPES = ("", "", "relief", "", "", "plane", "", "", "sphere", "", "", "low relief")
 ANALYTIC = ("ideal", "rough", "retro", TRANSLUCENT)  # materials that are not rendered
 MATERIALS_PER_SCENE, FAULTS_PER_CAPTURE = 4, 7
+RARE = 0.3  # fabrics that reflect towards the light are rarer than other materials
 PRIOR = {RIGHT: 0.9, TRANSLUCENT: 0.03}  # the other classes share the rest
 COLUMNS = ("features", "classes", "scenes", "materials")
 MEMBERS, HIDDEN, STEPS, FOLDS = 8, 32, 800, 4
@@ -108,9 +109,10 @@ def render(seed: int, index: int) -> Iterator[Rendered]:
     )
     tracer = Tracer(scene.mesh)
     visible = find_visible_surface(tracer, size, 2)
-    names = list(
-        rng.choice([*scene.materials, *ANALYTIC, *ANALYTIC], MATERIALS_PER_SCENE, replace=False)
+    others = rng.choice(
+        [*scene.materials, *ANALYTIC, *ANALYTIC], MATERIALS_PER_SCENE - 1, replace=False
     )
+    names = {str(rng.choice(list(scene.materials))), *map(str, others)}
     surface = (
         {name: each for name, each in scene.materials.items() if name in names},
         scene.patch_of_face,
@@ -139,7 +141,7 @@ def render(seed: int, index: int) -> Iterator[Rendered]:
     albedo = np.exp(rng.normal(0, rng.choice((0.0, 0.3)), (len(normals), 1)))
     lamps = NearLamps.of(positions / 2 * size, 1.0, visible.mask.shape, equal=True)
     at, falls = lamps.light_at(lamps.plane_points(*np.nonzero(visible.mask)))
-    for name in set(names) & set(ANALYTIC):
+    for name in sorted(names & set(ANALYTIC)):
         strength = rng.uniform(0.2, 0.8)
         far, close = (
             albedo
@@ -309,6 +311,7 @@ def train(paths: Sequence[Path], output: Path | None) -> None:
     rest = (1 - sum(PRIOR.values())) / (len(CLASSES) - len(PRIOR))
     weights = np.array([PRIOR.get(CLASSES[each], rest) for each in classes])
     weights /= np.bincount(classes)[classes]
+    weights[materials == "retro"] *= RARE
     found = np.empty((len(classes), len(CLASSES)))
     for fold in range(FOLDS):
         held = scenes % FOLDS == fold

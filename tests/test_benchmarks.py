@@ -11,11 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import load_file
 
 from scenes import read_json
 from splinecli import __version__
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
+from splinecli.judge.judge_net import CLASSES, JudgeNet
 from splinecli.maths.normals import unit
 from splinecli.workshop.save_weights import save_weights
 
@@ -274,20 +276,42 @@ def test_judgement(run, tmp_path):
     """Captures are the same at each run, and each is measured once."""
     pytest.importorskip("embreex", reason="needs the extra 'render'")
     made, found = tmp_path / "made", tmp_path / "found"
-    counts = ("--right", "2", "--faulty", "4")
-    run("judgement", "render", str(made), *counts, "--part", "1/2")
+    counts = "--right 2 --faulty 4"
+    run(f"judgement render {made} {counts} --part 1/2")
     first = (made / "000.right.file/im_01.png").read_bytes()
     shutil.rmtree(made / "000.right.file")
-    run("judgement", "render", str(made), *counts)
+    run(f"judgement render {made} {counts}")
     assert (made / "000.right.file/im_01.png").read_bytes() == first
     assert read_json(made / "003.tilt.15/truth.json")["kind"] == "tilt"
-    run("judgement", "measure", str(made), str(found), "--method", "ls")
+    run(f"judgement measure {made} {found} --method ls")
     stored = sorted(found.glob("*.json"))
     assert len(stored) == 6
     measured = stored[0].stat().st_mtime_ns
-    run("judgement", "measure", str(made), str(found), "--method", "ls")
+    run(f"judgement measure {made} {found} --method ls")
     assert stored[0].stat().st_mtime_ns == measured
     assert all(read_json(path)["mae"] < 60 for path in stored)
-    printed = run("judgement", "report", str(found))
-    assert "| tilt | 3 | 0 |" in printed
-    assert run("judgement", "report", str(found), str(found)) == printed
+    printed = run(f"judgement report {found}")
+    assert "| tilt | 3 | " in printed
+    assert run(f"judgement report {found} {found}") == printed
+
+
+def test_train_judge_net(run, tmp_path, coarse_shapes, monkeypatch):
+    """A network learns classes that one feature tells apart, and its probabilities follow."""
+    drawn = tmp_path / "drawn.npz"
+    run(f"train_judge_net draw {drawn} --scenes 1")
+    with np.load(drawn) as stored:
+        n_features = stored["features"].shape[1]
+        assert np.abs(stored["features"]).max() <= 15
+        assert set(stored["classes"]) <= set(range(len(CLASSES)))
+    rng = np.random.default_rng(0)
+    classes = rng.integers(0, len(CLASSES), 600)
+    features = rng.normal(0, 0.1, (600, n_features))
+    features[np.arange(600), classes] += 3
+    columns = {"classes": classes, "scenes": np.arange(600), "materials": np.full(600, "ideal")}
+    np.savez(tmp_path / "made.npz", features=features, **columns)
+    monkeypatch.setattr("train_judge_net.STEPS", 60)
+    printed = run(f"train_judge_net train {tmp_path}/made.npz -o {tmp_path}/net.safetensors")
+    assert "0.50 ideal        right, doubted   0.0 %" in printed
+    assert all(f"0.50 {name:12} named 100.0 %" in printed for name in CLASSES[2:])
+    net = JudgeNet(**load_file(tmp_path / "net.safetensors"))
+    assert (net.probabilities(features).argmax(axis=1) == classes).all()

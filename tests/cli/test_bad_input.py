@@ -62,7 +62,7 @@ def without_pixels(capture):
     """PGM files are recognised by their content."""
     for path in (*capture.glob("image*.png"), capture / "mask.png"):
         path.write_bytes(b"P5\n0 0\n255\n")
-    return ["--auto-mask"]
+    return "--auto-mask"
 
 
 def keep_two_images(capture):
