@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from judged import warnings_of
-from scenes import cap_directions, directions_at, halfway, ring_lights, shade, spiral_lights
-from splinecli.capture import Capture
+from scenes import cap_directions, directions_at, ring_lights, shade, spiral_lights
 from splinecli.capture.arrays import open_arrays
 from splinecli.capture.sample import CLOSEUP_SIDE, Sample, closeup_of, leave_out_background
 from splinecli.judge.checks import light_spread, repeated_images
@@ -34,27 +33,6 @@ def test_the_spread_of_lights() -> None:
     cone = np.array([(0.1 * np.cos(a), 0.1 * np.sin(a), 1) for a in np.linspace(0, 6, 9)])
     spread, in_cone = light_spread(cone)
     assert in_cone and spread < 0.1
-
-
-def codes(intensities: np.ndarray) -> list[str]:
-    """Return the warnings about a plane with faint bumps and broad gloss under 12 lights of these
-    intensities.
-    """
-    rng = np.random.default_rng(0)
-    lights = spiral_lights(12, 55, 15)
-    normals = np.concatenate((rng.normal(0, 0.3, (900, 2)), np.ones((900, 1))), axis=1)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    shaded = (
-        0.5 * (normals @ lights.T).clip(0) + 0.6 * (normals @ halfway(lights).T).clip(0) ** 12
-    ) * intensities
-    values = (shaded + rng.normal(0, 0.003, shaded.shape)).clip(0).astype(np.float32)
-    capture = Capture("glossy", values, lights, tuple(range(12)), np.ones((30, 30), np.bool_))
-    return [warning.code for warning in warnings_of(capture)]
-
-
-def test_unequal_intensities_that_cannot_be_estimated_are_named() -> None:
-    assert "unequal_intensities" in codes(np.tile((0.6, 1.5, 1.0), 4))
-    assert "unequal_intensities" not in codes(np.ones(12))
 
 
 def ball_before(background: float, size: int = 80) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ from scenes import ring_lights, shade, spiral_lights, square_grid
 from scenes import sphere as ball
 from splinecli.capture import Capture
 from splinecli.capture.near_lamps import NearLamps
+from splinecli.images.lamps import estimate_light_intensities
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.records.capture_warnings import CaptureWarning
 
@@ -93,8 +94,10 @@ def test_right_captures_are_not_doubted(shape: str, lights: str, gloss: float) -
     assert found(shape, values(shape, LIGHTS[lights], gloss=gloss), LIGHTS[lights]) == []
 
 
-@pytest.mark.parametrize("lights", LIGHTS)
-@pytest.mark.parametrize("shape", ["ball", "bumps", "plate"])
+@pytest.mark.parametrize(
+    ("shape", "lights"),
+    [*(("ball", lights) for lights in LIGHTS), ("bumps", "two rings"), ("bumps", "spiral")],
+)
 @pytest.mark.parametrize("known", [False, True])
 def test_encoded_values(shape: str, lights: str, known: bool) -> None:
     directions = LIGHTS[lights]
@@ -108,13 +111,35 @@ def test_encoded_values(shape: str, lights: str, known: bool) -> None:
         )
 
 
+@pytest.mark.parametrize("lights", LIGHTS)
+def test_a_flat_object_is_not_accused_of_another_fault(lights: str) -> None:
+    """Its pixels repeat each other, so that its images hardly determine how to read them."""
+    directions = LIGHTS[lights]
+    linear = values("plate", directions)
+    for observed in (encode(linear / linear.max()), values("plate", directions, constant=0.2)):
+        assert found("plate", observed, directions) == []
+
+
 def test_a_curve_behind_unequal_lamps() -> None:
     intensities = np.array([0.5, 1.0, 1.6, 0.8, 1.2, 0.7, 1.4, 0.9, 1.1, 0.6])
-    linear = values("bumps", LIGHTS["spiral"]) * intensities
-    # they are estimated, without a fault
-    assert found("bumps", linear / linear.max(), LIGHTS["spiral"]) == []
-    (warning,) = found("bumps", encode(linear / linear.max()), LIGHTS["spiral"])
-    assert warning.code == "nonlinearity_suspected"
+    linear = values("ball", LIGHTS["spiral"]) * intensities
+    directions, mask = LIGHTS["spiral"], surface("ball")[1]
+    for observed, expected in (
+        (linear, set()),
+        (encode(linear / linear.max()), {"nonlinearity_suspected"}),
+    ):
+        values_seen = observed.astype(np.float32)
+        estimated = estimate_light_intensities(values_seen, None, directions)
+        capture = Capture(
+            "ball",
+            values_seen / estimated.astype(np.float32),
+            directions,
+            tuple(range(10)),
+            mask,
+            estimated_intensities=estimated,
+        )
+        codes = CODES & {warning.code for warning in warnings_of(capture)}
+        assert codes == expected
 
 
 @pytest.mark.parametrize("widths", [1.5, 2.0, 3.0, 4.0])
@@ -133,13 +158,23 @@ def test_near_lamps(shape: str, widths: float) -> None:
     assert stated == pytest.approx(widths, rel=0.26)
 
 
-@pytest.mark.parametrize(
-    ("shape", "lights"), [("ball", "spiral"), ("bumps", "two rings"), ("plate", "spiral")]
-)
+@pytest.mark.parametrize("lights", LIGHTS)
 @pytest.mark.parametrize("share", [0.2, 1.0])
-def test_constant_light(shape: str, lights: str, share: float) -> None:
-    (warning,) = found(shape, values(shape, LIGHTS[lights], constant=share), LIGHTS[lights])
+def test_constant_light(lights: str, share: float) -> None:
+    (warning,) = found("ball", values("ball", LIGHTS[lights], constant=share), LIGHTS[lights])
     assert warning.code == "constant_light" and "--ambient" in warning.text
+
+
+@pytest.mark.parametrize("lights", ["two rings", "spiral"])
+def test_a_relief_under_constant_light_looks_translucent(lights: str) -> None:
+    """Light that enters a material softens its shading in the same way."""
+    observed, mask = values("bumps", LIGHTS[lights], constant=0.2), surface("bumps")[1]
+    directions = LIGHTS[lights]
+    capture = Capture(
+        "wax", observed.astype(np.float32), directions, tuple(range(len(directions))), mask
+    )
+    (warning,) = [each for each in warnings_of(capture) if each.code != "few_lights"]
+    assert warning.code == "unknown_material" and warning.error_deg
 
 
 def test_constant_light_under_four_lights() -> None:
