@@ -409,6 +409,8 @@ class Check:
 # faults before it are mended.
 CHECKS = [
     Check(same_images, needs_lights=False),
+    Check(missing_mask, needs_lights=False),
+    Check(few_lights, needs_lights=False),
     Check(lights_near_axis),
     Check(crowded_lights),
     Check(decisive_readings),
@@ -416,8 +418,6 @@ CHECKS = [
     Check(other_scale),
     Check(odd_image),
     Check(wrong_lights),
-    Check(missing_mask, needs_lights=False),
-    Check(few_lights, needs_lights=False),
     Check(other_readings),
     Check(tilted_lights),
     Check(strange_material),

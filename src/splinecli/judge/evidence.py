@@ -186,8 +186,8 @@ class Evidence:
         kinds = set(readings) - self.accepted
         if not self.linear:
             kinds -= {"curve"}
-        if self.has_positions:
-            kinds -= {"near"}
+        if self.has_positions:  # distant lights in spite of them explain what else is found
+            kinds = kinds - {"near"} if self.lamps is not None else set()
         if self.estimated is not None:  # they are divided out
             kinds -= {"intensities"}
         if not kinds:
