@@ -36,6 +36,7 @@ COUNT = 160  # rows and columns of a surface
 FRAME = 1.06  # half-width of surfaces that fill the image
 SAMPLES = 2  # along a side of a pixel
 PATHS, BOUNCES = 24, 2  # of light between surfaces
+LEAST_SHARE = 0.04  # of the pixels that show the object
 
 
 # Shapes
@@ -368,10 +369,12 @@ def render(
 
     `files` are the meshes of the shape `mesh`, and the networks of measured materials.
     """
-    drawn = SHAPES.get(shape, partial(draw_mesh_of_file, files[0]))(rng)
-    mesh = drawn if shape == "cloth" else fit_to_frame(drawn)
-    tracer = Tracer(mesh)
-    visible = find_visible_surface(tracer, size, SAMPLES)
+    draw = SHAPES.get(shape, partial(draw_mesh_of_file, files[0]))
+    while True:
+        mesh = draw(rng) if shape == "cloth" else fit_to_frame(draw(rng))
+        visible = find_visible_surface(tracer := Tracer(mesh), size, SAMPLES)
+        if len(visible.normals) > LEAST_SHARE * size**2:  # not a thin body from its edge
+            break
     patches = int(rng.integers(8, 200)) if material == "varying" else 1
     patch_of_face = draw_patches(mesh, patches, rng)
     look = make_material(material, patches, rng)
