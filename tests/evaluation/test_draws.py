@@ -2,6 +2,7 @@
 each draw.
 """
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -102,6 +103,13 @@ def test_a_draws_file(tmp_path):
         3,
     )
     file.check_against(LIGHTS)
+
+
+def test_a_long_draw_is_read_in_a_time_that_grows_with_its_length(tmp_path):
+    path = write(tmp_path, " ".join(map(str, range(40_000))))
+    started = time.process_time()
+    assert read_draws(path).n_lights == 40_000
+    assert time.process_time() - started < 3  # the square took ten seconds
 
 
 @pytest.mark.parametrize(
