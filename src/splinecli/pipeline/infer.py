@@ -247,7 +247,7 @@ def infer_capture(
         estimate, distilled = estimate_capture(work, load, distil=options.distil, clock=clock)
         for warning in estimate.capture.warnings:
             # usual in a batch, and of all its captures
-            once = warning.code if warning.kind is EIGHT_BIT else None
+            once = warning.text if warning.kind is EIGHT_BIT else None
             observer.warn(f"{capture.name}: {warning}", once=once)
         estimator = load()
         loaded = None if estimator.weights is None else estimator.weights["sha256"]
