@@ -311,6 +311,14 @@ def test_light_files_that_are_named(folder, name, text, hint):
     assert check(open_capture(folder, CaptureOptions(lights=lights, **options)), None) == []
 
 
+def test_files_too_long_for_the_lights_are_not_read_for_a_hint(folder):
+    """Fifty of 0.9 MB took a minute and more."""
+    (folder / "light_directions.txt").unlink()
+    (folder / "dirs.txt").write_text(LINES + "\n# notes" * 5000)
+    with pytest.raises(InputError, match="Pass --lights FILE"):
+        open_capture(folder)
+
+
 def test_a_dome_has_positions(folder):
     lamps = LIGHTS * 300 + (0, 0, 20)
     positions = [dict(zip("xyz", row, strict=True)) for row in rows(lamps)]

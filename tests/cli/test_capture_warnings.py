@@ -216,6 +216,24 @@ def test_dark_values_of_sixteen_bits_are_dark(run):
     assert codes_of(run, write_capture(Path("dark"), dark, LIGHTS, mask=mask)) == ["dark_images"]
 
 
+@pytest.mark.parametrize(
+    ("share", "words", "is_dark"),
+    [
+        (0.9, "The images have 8 bits, which costs less than 0.5 degrees.", False),
+        (0.4, "The images have 8 bits and use 40 % of the range, which costs up to 0.8", False),
+        (0.2, "The images have 8 bits and use 20 % of the range, which costs up to 1.6", True),
+        (0.1, "less than 25 % of the range: 10, such as 000.png; a longer exposure", True),
+    ],
+)
+def test_what_8_bits_cost_depends_on_the_exposure(run, share, words, is_dark):
+    images, mask = ball()
+    images *= share / np.quantile(images[:, mask], 0.99, axis=1).max()
+    eight = stored(images, 255).astype(np.uint8)
+    write_capture(Path("eight"), eight, LIGHTS, mask=mask)
+    found = run("info eight --json", says=words).json["warning_codes"]
+    assert found == ["eight_bit", *["dark_images"] * is_dark]
+
+
 @pytest.mark.parametrize("others", [False, True])
 def test_one_file_of_another_scale(run, others):
     images, mask = ball()

@@ -97,6 +97,10 @@ def test_a_draws_file(tmp_path):
     file.check_against(LIGHTS)
 
 
+def test_a_long_draw_is_read(tmp_path):
+    assert read_draws(write(tmp_path, " ".join(map(str, range(40_000))))).n_lights == 40_000
+
+
 @pytest.mark.parametrize(
     "text, problem",
     [

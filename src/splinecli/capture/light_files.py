@@ -155,6 +155,7 @@ def light_option(folders: Sequence[Path], n_images: int) -> str | None:
     None for no such file.
     """
     suffixes = {".txt", *(suffix for each in FORMATS for suffix in each.suffixes)}
+    longest = min(numbers.MOST_TEXT, 20_000 + 500 * n_images)  # others take seconds to read
     for folder in folders:
         with suppress(InputError, OSError):
             entries = [
@@ -164,7 +165,7 @@ def light_option(folders: Sequence[Path], n_images: int) -> str | None:
             for path in entries[:50]:
                 name = path.name.lower()
                 is_other = re.search("intens|camera|filenames|lobes", name)
-                if is_other or path.stat().st_size > numbers.MOST_TEXT:
+                if is_other or path.stat().st_size > longest:
                     continue
                 angles: RowForm = "slant-tilt" if re.search("slant|tilt", name) else "azel"
                 for form in ("xyz", angles):

@@ -3,7 +3,9 @@
 SIGTERM, which job schedulers send, ends it within two seconds.
 """
 
+import math
 import os
+import select
 import signal
 import threading
 import time
@@ -11,7 +13,8 @@ from contextlib import suppress
 from types import FrameType
 
 INTERRUPTED = 130  # exit code of an interrupted process
-GRACE_SECONDS = 1.5  # time that the command has to clean up
+# time that the command has to clean up
+GRACE_SECONDS = {int(signal.SIGTERM): 1.5, int(signal.SIGINT): 5.0}
 # set when the command reports the interruption itself, to avoid a second message
 TOLD = threading.Event()
 DEFERRED = threading.Event()  # set when a signal arrives during an import, which must finish first
@@ -20,10 +23,10 @@ DEFERRED = threading.Event()  # set when a signal arrives during an import, whic
 def end_on_signals() -> None:
     """Raise KeyboardInterrupt in the main thread at Ctrl-C and SIGTERM.
 
-    If SIGTERM does not end the process this way, it is ended from another thread. Python delivers a
-    signal only between two of its instructions. One call into a library may take minutes, and an
-    exception in a callback of a library is lost. A separate thread is notified of the signal
-    immediately.
+    If this does not end the process in time, it is ended from another thread. Python delivers a
+    signal only between two of its instructions. One call into a library may take minutes, so may
+    the import of PyTorch in a thread that has to end first, and an exception in a callback of a
+    library is lost. A separate thread is notified of the signal immediately.
     """
     signal.signal(signal.SIGTERM, _interrupt)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored, as by nohup
@@ -69,7 +72,9 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _watch(reader: int) -> None:
-    while os.read(reader, 1) != bytes([signal.SIGTERM]):
-        pass
-    time.sleep(GRACE_SECONDS)
+    end = math.inf
+    while (left := end - time.monotonic()) > 0:
+        if select.select([reader], [], [], None if left == math.inf else left)[0]:
+            grace = GRACE_SECONDS.get(os.read(reader, 1)[0], math.inf)
+            end = min(end, time.monotonic() + grace)
     os._exit(report_interruption())

@@ -87,14 +87,16 @@ def _read_draw(words: list[str], n_lights: int, path: Path, line: int) -> Draw:
                 f'found "{word[:40]}", expected a light index from 0', path=path, line=line
             )
     draw = tuple(map(int, words))
-    for position, index in enumerate(draw):
-        if index in draw[:position]:
+    seen = set[int]()
+    for index in draw:
+        if index in seen:
             raise InputError(
                 f"light index {index} is listed twice",
                 path=path,
                 line=line,
                 hint="Name each light once",
             )
+        seen.add(index)
     if len(draw) < MIN_LIGHTS:
         raise InputError(
             f"found {len(draw)} light indices, expected at least {MIN_LIGHTS}", path=path, line=line

@@ -303,7 +303,7 @@ def infer_capture(
         source, capture = work.files, work.made
         for warning in estimate.capture.warnings:
             # usual in a batch, and of all its captures
-            once = warning.code if warning.kind is EIGHT_BIT else None
+            once = warning.text if warning.kind is EIGHT_BIT else None
             observer.warn(f"{capture.name}: {warning}", once=once)
         estimator = load()
         loaded = None if estimator.weights is None else estimator.weights["sha256"]

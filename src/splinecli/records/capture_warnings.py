@@ -81,7 +81,9 @@ CURVE_MENDED = WarningKind(
     "`--transfer linear` if they are linear",
 )
 DARK_IMAGES = WarningKind(
-    "dark_images", "The images use a small part of the range", "Use a longer exposure"
+    "dark_images",
+    "The images use less than 5 % of the range, or 25 % with 8 bits",
+    "Use a longer exposure",
 )
 DISPLAY_DECODED = WarningKind(
     "display_decoded",
@@ -95,8 +97,8 @@ DISPLAY_ENCODED = WarningKind(
 )
 EIGHT_BIT = WarningKind(
     "eight_bit",
-    "The images have 8 bits",
-    "Export 16-bit linear images, or use RAW; [round](robustness.md#8-bits), do not cut",
+    "The images have 8 bits; the text states what [this costs](robustness.md#8-bits)",
+    "Export 16-bit linear images, or use RAW; round, do not cut",
 )
 ELEVATION_SUSPECTED = fault(
     "elevation_suspected",
@@ -340,19 +342,6 @@ def mask_inverted(name: str) -> CaptureWarning:
         " probably inverted."
     )
     return CaptureWarning(MASK_INVERTED, f"{text} A mask is white on the object.")
-
-
-def eight_bit(any_8_bit: bool) -> list[CaptureWarning]:
-    """Warn of images with 8 bits, if there are any."""
-    return (
-        [
-            CaptureWarning(
-                EIGHT_BIT, "The images have 8 bits; 16-bit linear images give better normals."
-            )
-        ]
-        if any_8_bit
-        else []
-    )
 
 
 def estimated_lights(errors_deg: Float64Array) -> CaptureWarning:
