@@ -98,7 +98,8 @@ def test_a_draws_file(tmp_path):
 
 
 def test_a_long_draw_is_read(tmp_path):
-    assert read_draws(write(tmp_path, " ".join(map(str, range(40_000))))).n_lights == 40_000
+    path = put(tmp_path / "draws.txt", " ".join(map(str, range(40_000))))
+    assert read_draws(path).n_lights == 40_000
 
 
 @pytest.mark.parametrize(
