@@ -135,7 +135,7 @@ def test_what_cannot_be_checked_is_said_and_no_error(run, medallion):
     usual = run(f"infer {medallion} --method ls --light-indices 0,2,4,6,8 -o usual")
     assert "not be checked" not in usual.err
     few = run(f"infer {medallion} --method ls --light-indices 0,2,4,6,8 --strict --json")
-    warning, other = few.json[0]["warnings"]
+    other, warning = few.json[0]["warnings"]
     assert (warning["code"], other["code"]) == ("lights_unchecked", "few_lights")
     assert warning["text"].endswith(
         "their order (fewer than 6 lights, too few lit pixels, or a flat object)."

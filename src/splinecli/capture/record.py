@@ -56,11 +56,6 @@ def azimuth_of(first_light: str) -> float:
     return azimuth
 
 
-def side_of(azimuth_deg: float) -> str:
-    """Return the side of the image that is nearest to an azimuth, such as `upper-left`."""
-    return min(SIDES_DEG, key=lambda side: abs((SIDES_DEG[side] - azimuth_deg + 180) % 360 - 180))
-
-
 def placeholders(n_lights: int) -> Float64Array:
     """Return arbitrary directions (F, 3) that give normals, as placeholders until the lights are
     estimated.

@@ -2,7 +2,7 @@
 their order.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -26,6 +26,7 @@ from splinecli.maths.robust import fit_robustly
 from splinecli.records import capture_warnings as codes
 from splinecli.records.capture_warnings import CaptureWarning, WarningKind
 
+ALIGN_ADVICE = "Add --align, or photograph from a tripod."
 TILT_ADVICE = (
     "They may have been measured in another frame than the camera's, such as the table's. Tilt them"
     " back"
@@ -46,6 +47,8 @@ class Finding(NamedTuple):
     after: Evidence | None = None
     # whether the fault is so clear that it is mended without being asked
     clear: bool = False
+    # whether the checks that follow do not depend on it although it is not mended
+    harmless: bool = False
     cause: str = ""  # a sentence that says why, for a fault that can be mended
 
 
@@ -62,9 +65,9 @@ def shifted_images(seen: Evidence) -> Iterator[Finding]:
         f"{len(shifts)} of {len(names)} images {'is' if len(shifts) == 1 else 'are'} shifted"
         f" against the others, in pixels: {named}{more}. The camera or the object moved."
     )
-    text = f"{cause} Add --align, or photograph from a tripod."
+    text = f"{cause} {ALIGN_ADVICE}"
     warning = CaptureWarning(codes.IMAGES_SHIFTED, text, seen.shift_error_deg)
-    yield Finding(warning, after, not seen.found, cause)
+    yield Finding(warning, after, not seen.found, cause=cause)
 
 
 def _explains_more(after: Evidence, before: Evidence) -> bool:
@@ -204,7 +207,9 @@ def wrong_lights(seen: Evidence) -> Iterator[Finding]:
     check = seen.light_check
     mended = None if check.mended is None else seen.under_lights(check.mended)
     for warning, cause in light_warnings(check, seen.origin, seen.frame, seen.strict):
-        yield Finding(warning, mended if cause else None, check.is_clear, cause)
+        after = mended if cause else None
+        # Lights in another frame explain the images equally well.
+        yield Finding(warning, after, check.is_clear, warning.kind == codes.LIGHT_FRAME, cause)
 
 
 def tilted_lights(seen: Evidence) -> Iterator[Finding]:
@@ -217,7 +222,7 @@ def tilted_lights(seen: Evidence) -> Iterator[Finding]:
     text = f"{cause} {TILT_ADVICE}, as {WRITES_MENDED} does."
     error_deg = median_turn_deg(seen.observations, seen.directions, mended)
     warning = CaptureWarning(codes.LIGHTS_TILTED, text, error_deg)
-    yield Finding(warning, seen.under_lights(mended), probability > CLEAR, cause)
+    yield Finding(warning, seen.under_lights(mended), probability > CLEAR, cause=cause)
 
 
 def strange_material(seen: Evidence) -> Iterator[Finding]:
@@ -273,7 +278,7 @@ def other_readings(
             kind, cause, advice = found
             warning = CaptureWarning(kind, f"{cause} {advice}", error_deg)
             clear = doubt.is_clear and kind in (codes.NONLINEARITY_SUSPECTED,)
-            yield Finding(warning, after, clear, cause)
+            yield Finding(warning, after, clear, cause=cause)
         seen = after
 
 
@@ -482,7 +487,8 @@ def check_capture(source: Source, capture: Capture, *, strict: bool = False) -> 
             seen = finding.after or seen
             if clear and finding.clear and finding.after is not None:
                 remedy = _remedy(given, seen, (*remedy.faults, finding))
-            relies &= finding.after is not None or finding.warning.kind not in DOUBTED
+            doubted = finding.warning.kind in DOUBTED and not finding.harmless
+            relies &= finding.after is not None or not doubted
     if light_check is None and not seen.found:
         light_check = seen.light_check
     mended = _remedy(given, seen, ()).lights
@@ -538,14 +544,18 @@ def check_confidence(expected_under_5: float | None) -> list[CaptureWarning]:
 
 
 def refuse_if_strict(
-    warnings: Iterable[CaptureWarning], name: str, *, strict: bool, mends: bool = False
+    warnings: Iterable[CaptureWarning],
+    name: str,
+    *,
+    strict: bool,
+    mended: Collection[WarningKind] = (),
 ) -> None:
     """Raise InputError for the first warning that says that an input is probably wrong, if
-    `strict`. `mends` is whether it would be mended otherwise.
+    `strict`. Faults of the kinds `mended` are mended otherwise.
     """
     wrong = next((warning for warning in warnings if warning.is_error), None)
     if strict and wrong is not None:
-        how = "with this corrected" if mends else "nevertheless"
+        how = "with this corrected" if wrong.kind in mended else "nevertheless"
         raise InputError(
             f"{name}: {wrong.text.removesuffix('.')}", hint=f"Leave --strict out to go on {how}"
         )

@@ -15,7 +15,6 @@ import numpy as np
 from scipy.ndimage import binary_erosion, gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from splinecli.capture.record import side_of
 from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.maths.normals import unit
 from splinecli.maths.robust import fit_robustly, shadow_weights
@@ -50,8 +49,8 @@ class Tilt(NamedTuple):
     def cause(self) -> str:
         """The tilt and its evidence, as a sentence about lights."""
         return (
-            f"look tilted together, by {self.degrees:.0f} degrees towards the"
-            f" {side_of(self.towards_deg)}: tilted back, they give normals that fit a surface"
+            f"look tilted together, by {self.degrees:.0f} degrees towards the azimuth of"
+            f" {self.towards_deg:.0f} degrees: tilted back, they give normals that fit a surface"
             f" better (curl {self.left * self.curl:.3f} against {self.curl:.3f})."
         )
 

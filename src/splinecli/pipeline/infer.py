@@ -38,12 +38,14 @@ from splinecli.recipe.steps import begin, follow, images_to_read
 from splinecli.recipe.work import Work
 from splinecli.records.capture_warnings import (
     EIGHT_BIT,
-    LIGHTS_MENDED,
+    LIGHT_FRAME,
+    LIGHT_ORDER,
     LIGHTS_TILTED,
     NOT_DISTILLED,
     ROUGH_LIGHTS,
     UNTRAINED_LIGHTS,
     CaptureWarning,
+    lights_mended,
 )
 from splinecli.records.output_files import (
     BYTES_OF_SURFACE,
@@ -188,8 +190,11 @@ def estimate_capture(
     prepared = work.made.warnings
     judged = work.judgement.warnings if work.judgement else ()
     remedy = work.judgement.remedy if work.judgement else None
-    mends = remedy is not None and not (work.options.keeps_lights or work.options.as_stored)
-    refuse_if_strict([*prepared, *judged], work.made.name, strict=strict, mends=mends)
+    mended = set() if remedy is None else {fault.warning.kind for fault in remedy.faults}
+    mended |= {LIGHTS_TILTED}
+    if work.options.keeps_lights:
+        mended -= {LIGHTS_TILTED, LIGHT_FRAME, LIGHT_ORDER}
+    refuse_if_strict([*prepared, *judged], work.made.name, strict=strict, mended=mended)
     capture = follow(work, "refinement", "refinement").made
     if work.options.refine_lights:
         judged = tuple(warning for warning in judged if warning.kind != ROUGH_LIGHTS)
@@ -214,7 +219,7 @@ def estimate_capture(
     # The other warnings explain why the confidence is low.
     if not any(warning.error_deg and warning.is_error for warning in warnings):
         warnings += check_confidence(estimate.expected_under_5)
-    refuse_if_strict(warnings, capture.name, strict=strict)
+    refuse_if_strict(warnings, capture.name, strict=strict, mended=mended)
     estimate = replace(estimate, capture=replace(estimate.capture, warnings=tuple(warnings)))
     return estimate, distilled, work
 
@@ -237,23 +242,22 @@ def undo_tilt(
     if tilt is None or not tilt.is_clear:
         return estimate, []
     cause = f"The lights {tilt.cause}"
-    lights, left = capture.light_directions, tilt
+    accepted, left = estimate, tilt
     for _ in range(_TILTS if mends else 0):
-        lights = lights @ left.matrix.T
+        lights = accepted.capture.light_directions @ left.matrix.T
         if (lights[:, 2] <= 0).any():
             break
-        mended = again(replace(capture, light_directions=lights))
-        found = find_tilt(mended.normal_map, capture.mask)
-        if found is None or found.curl > _LEAST_FALL * tilt.curl:
+        tried = again(replace(capture, light_directions=lights))
+        found = find_tilt(tried.normal_map, capture.mask)
+        if found is None or found.curl > _LEAST_FALL * left.curl:
             break
-        left = found
+        accepted, left = tried, found
         if left.degrees < _SMALL_TILT_DEG or left.left > _LEAST_FALL:
             break
-    if left is not tilt:
-        text = f"{cause} They were corrected; --light-frame x-right,y-up keeps those of the file."
-        codes = (*capture.mended, LIGHTS_TILTED.code)
-        mended = replace(mended, capture=replace(mended.capture, mended=codes))
-        return mended, [CaptureWarning(LIGHTS_MENDED, text)]
+    if accepted is not estimate:
+        codes = tuple(dict.fromkeys((*capture.mended, LIGHTS_TILTED.code)))
+        accepted = replace(accepted, capture=replace(accepted.capture, mended=codes))
+        return accepted, [lights_mended(cause)]
     warning = CaptureWarning(LIGHTS_TILTED, f"{cause} {TILT_ADVICE}.", tilt.degrees)
     # the confidence accounts for it
     return again(replace(capture, warnings=(*capture.warnings, warning))), [warning]

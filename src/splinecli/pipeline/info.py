@@ -20,6 +20,7 @@ from splinecli.pipeline.infer import BASE_BYTES, infer_bytes
 from splinecli.pipeline.infer_options import InfoOptions, ReadingOptions
 from splinecli.recipe.steps import begin, follow, images_to_read
 from splinecli.recipe.work import Work
+from splinecli.records.capture_warnings import LIGHTS_MENDED
 from splinecli.system.files import check_free, write_bytes
 from splinecli.system.progress import SILENT, Observer
 
@@ -75,7 +76,9 @@ def describe_capture(
             "warning_codes": [warning.code for warning in warnings],
         }
         if mended_lights is not None:
-            mended = capture.light_directions if capture.mended else judgement.mended_lights
+            mended = judgement.mended_lights
+            if any(warning.kind is LIGHTS_MENDED for warning in capture.warnings):
+                mended = capture.light_directions
             if mended is not None:
                 write_bytes(
                     mended_lights, encode_lights(mended_lights, mended, source.files.images)

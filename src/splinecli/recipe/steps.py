@@ -26,7 +26,7 @@ from splinecli.images.lamps import estimate_light_intensities, lamp_colours
 from splinecli.images.lens_blur import remove_blur, surroundings
 from splinecli.images.mask import find_object
 from splinecli.images.saturation import restore_saturated
-from splinecli.judge.checks import check_capture
+from splinecli.judge.checks import ALIGN_ADVICE, check_capture
 from splinecli.judge.explanations import SRGB_EXPONENT
 from splinecli.lights.light_fit import refine_capture
 from splinecli.maths import Float64Array
@@ -38,9 +38,15 @@ from splinecli.records.capture_warnings import (
     CURVE_MENDED,
     ESTIMATED_INTENSITIES,
     IMAGES_ALIGNED,
-    LIGHTS_MENDED,
+    IMAGES_SHIFTED,
+    LIGHT_FRAME,
+    LIGHT_ORDER,
+    LIGHTS_TILTED,
+    NONLINEARITY_SUSPECTED,
     CaptureWarning,
+    WarningKind,
     estimated_lights,
+    lights_mended,
 )
 from splinecli.system.files import StrPath
 
@@ -203,53 +209,69 @@ def judge(work: Work, _: Callable[[], object]) -> Work:
 
 
 def mend(work: Work, _: Callable[[], object]) -> Work:
-    """Read the capture again as the faults that are clear demand; keep it as it is if the images
-    then contradict it in another way.
+    """Read the capture again as the faults that are clear demand, apart from values that options
+    give; keep it as it is if the images then contradict it in another way.
     """
     judgement, source, options = work.judgement, work.source, replace(work.options, mends=False)
     assert judgement is not None and judgement.remedy is not None  # the step is wanted
-    remedy, notes = judgement.remedy, list[CaptureWarning]()
-    causes = " ".join(fault.cause for fault in remedy.faults)
-    if remedy.lights is not None:
-        if options.keeps_lights or source.has_positions or (remedy.lights[:, 2] <= 0).any():
-            return work
+    remedy, notes, mended_kinds = judgement.remedy, list[CaptureWarning](), set[WarningKind]()
+    files = source if isinstance(source, CaptureSource) else None
+
+    def causes(*kinds: WarningKind) -> str:
+        """Return the causes of the faults of these kinds, which are mended."""
+        mended_kinds.update(kinds)
+        return " ".join(each.cause for each in remedy.faults if each.warning.kind in kinds)
+
+    keeps = options.keeps_lights or source.has_positions
+    if remedy.lights is not None and not keeps and (remedy.lights[:, 2] > 0).all():
         directions = source.light_directions.copy()
         directions[list(work.indices)] = remedy.lights
         source = replace(source, light_directions=directions)
-        text = f"{causes} They were corrected; --light-frame x-right,y-up keeps those of the file."
-        notes.append(CaptureWarning(LIGHTS_MENDED, text))
-    if remedy.curve is not None:
-        if not isinstance(source, CaptureSource) or not source.radiometry.automatic:
-            return work
+        why = causes(LIGHT_FRAME, LIGHT_ORDER, LIGHTS_TILTED)
+        notes.append(lights_mended(why, in_files=files is not None))
+    if remedy.curve is not None and files is not None and files.radiometry.automatic:
         curve = SRGB if remedy.curve == SRGB_EXPONENT else remedy.curve
-        radiometry = replace(source.radiometry, curve=curve, automatic=False)
+        radiometry = replace(files.radiometry, curve=curve, automatic=False)
+        assert isinstance(source, CaptureSource)
         source = replace(source, radiometry=radiometry)
-        text = f"{causes} They were decoded; --transfer linear reads them as they are."
-        notes.append(CaptureWarning(CURVE_MENDED, text))
-    if remedy.align:
-        if not isinstance(source, CaptureSource) or len(work.indices) < MIN_IMAGES:
-            return work
-        options = replace(options, align=True)
+        text = f"{causes(NONLINEARITY_SUSPECTED)} They were decoded; --transfer linear reads them"
+        notes.append(CaptureWarning(CURVE_MENDED, f"{text} as they are."))
+    moved = ""
+    if remedy.align and files is not None and len(work.indices) >= MIN_IMAGES:
+        options, moved = replace(options, align=True), causes(IMAGES_SHIFTED)
+    faults = [each.warning for each in remedy.faults if each.warning.kind in mended_kinds]
     try:
-        mended = follow(begin(source, work.indices, options), last="judgement")
+        mended = follow(begin(source, work.indices, options), last="judgement") if faults else None
     except InputError:  # images that cannot be aligned
-        return work
-    left = () if mended.judgement is None else mended.judgement.warnings
-    if any(warning.is_error for warning in left):
-        return work
+        mended = None
+    judged = None if mended is None else mended.judgement
+    kept = {each.kind for each in judgement.warnings} - mended_kinds
+    if (
+        mended is None
+        or judged is None
+        or any(each.is_error and each.kind not in kept for each in judged.warnings)
+    ):
+        return _without_align(work) if moved else work
     prepared = [
-        replace(each, text=f"{causes} {each.text} --as-stored keeps their places.")
-        if remedy.align and each.kind is IMAGES_ALIGNED
+        replace(each, text=f"{moved} {each.text} --as-stored keeps their places.")
+        if moved and each.kind is IMAGES_ALIGNED
         else each
         for each in mended.made.warnings
     ]
-    capture = replace(
-        mended.made,
-        warnings=(*prepared, *notes),
-        mended=tuple(fault.warning.code for fault in remedy.faults),
+    codes = tuple(each.code for each in faults)
+    capture = replace(mended.made, warnings=(*prepared, *notes), mended=codes)
+    judgement = judgement._replace(warnings=judged.warnings)
+    return replace(mended, options=work.options, capture=capture, judgement=judgement)
+
+
+def _without_align(work: Work) -> Work:
+    """Return the work whose warnings do not advise to align, because that was tried in vain."""
+    assert work.judgement is not None
+    warnings = tuple(
+        replace(each, text=each.text.replace(ALIGN_ADVICE, "Photograph from a tripod."))
+        for each in work.judgement.warnings
     )
-    kept = judgement._replace(warnings=left)
-    return replace(mended, options=work.options, capture=capture, judgement=kept)
+    return replace(work, judgement=work.judgement._replace(warnings=warnings))
 
 
 def refine(work: Work, _: Callable[[], object]) -> Work:

@@ -344,6 +344,13 @@ def mask_inverted(name: str) -> CaptureWarning:
     return CaptureWarning(MASK_INVERTED, f"{text} A mask is white on the object.")
 
 
+def lights_mended(cause: str, *, in_files: bool = True) -> CaptureWarning:
+    """Report that the light directions were corrected, for a cause in a sentence."""
+    option = "--light-frame x-right,y-up" if in_files else "as_stored=True"
+    text = f"{cause} They were corrected; {option} keeps them as given."
+    return CaptureWarning(LIGHTS_MENDED, text)
+
+
 def estimated_lights(errors_deg: Float64Array) -> CaptureWarning:
     """Report that the light directions were estimated, with expected errors (F,) in degrees."""
     return CaptureWarning(
