@@ -84,7 +84,7 @@ REFINED_PIXELS, REFINED_BYTES = (736**2, 1100)
 
 # A network follows a tilt of its lights only in part, so that it is undone in steps, of which each
 # reduces the curl to the share or less.
-_TILTS, _LEAST_FALL, _SMALL_TILT_DEG = 3, 0.95, 4.0
+_TILTS, _LEAST_FALL, _SMALL_TILT_DEG, _LEAST_CHANGE = 3, 0.95, 4.0, 0.03
 
 
 def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
@@ -230,7 +230,8 @@ def undo_tilt(
     """Return the estimate under lights that are tilted back if the normals of a network show that
     all lights are tilted, and warnings.
 
-    The lights are changed only if this reduces the curl of the new normals, and only if `mends`.
+    The lights are changed only if this reduces the curl of the new normals and does not increase
+    the errors that the network expects, and only if `mends`.
     """
     capture = estimate.capture
     others = tuple(each for each in capture.warnings if each.kind != LIGHTS_TILTED)
@@ -250,6 +251,11 @@ def undo_tilt(
         tried = again(replace(capture, light_directions=lights))
         found = find_tilt(tried.normal_map, capture.mask)
         if found is None or found.curl > _LEAST_FALL * left.curl:
+            break
+        # Under lights that were right, the network expects larger errors once they are tilted.
+        if (tried.expected_under_5 or 0) < (estimate.expected_under_5 or 0) - _LEAST_CHANGE:
+            if accepted is estimate:
+                return estimate, []
             break
         accepted, left = tried, found
         if left.degrees < _SMALL_TILT_DEG or left.left > _LEAST_FALL:
