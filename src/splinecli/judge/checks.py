@@ -243,6 +243,10 @@ def rough_lights(seen: Evidence) -> Iterator[Finding]:
         or (refined := would_refine(seen.observations, seen.factors, seen.directions)) is None
     ):
         return
+    after = seen.under_lights(refined.directions).tilt
+    # The residual of gloss and fabric falls as well, but the normals then fit a surface worse.
+    if seen.tilt is not None and after is not None and after.curl > 0.98 * seen.tilt.curl:
+        return
     moved_deg = angle_between_deg(refined.directions, seen.directions)
     text = (
         f"The light directions are probably inaccurate: moving them by {moved_deg.mean():.1f}"
