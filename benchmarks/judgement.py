@@ -32,7 +32,14 @@ from splinecli.records.capture_warnings import PROBABLY_WRONG
 NO_CAUSE = {"low_confidence", "unknown_material"}  # warnings that accuse no input
 GAP, WORSE_DEG, HARMLESS_DEG = 25, 0.5, 0.2
 """An estimate is silently wrong if its expected share exceeds the true one by so many points."""
-UNDO = {"estimated_intensities", "estimated_colours", "display_decoded"}
+UNDO = {
+    "estimated_intensities",
+    "estimated_colours",
+    "display_decoded",
+    "lights_mended",
+    "curve_mended",
+    "images_aligned",
+}
 """Warnings whose text says how to undo what was done, not how to mend."""
 
 REMEDIES: dict[str, tuple[str, Callable[[str], dict[str, Any]]]] = {
