@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scenes import cap_directions, sphere
-from splinecli.judge.tilt import curl_of, find_tilt, fitted_normals
+from splinecli.judge.tilt import curl_of, find_tilt, fitted_map
 from splinecli.maths.normals import unit
 
 SIZE = 72
@@ -37,19 +37,19 @@ def turned(degrees: float, towards_deg: float) -> np.ndarray:
 def test_a_tilt_is_found_and_undone(name, degrees, towards_deg):
     normals, mask = surface(name)
     observed, given = (normals @ LIGHTS.T).clip(0), turned(degrees, towards_deg)
-    tilt = find_tilt(fitted_normals(observed, mask, given), mask)
+    tilt = find_tilt(fitted_map(observed, mask, given), mask)
     assert tilt.degrees == pytest.approx(degrees, abs=2.5)
     assert abs((tilt.towards_deg - towards_deg + 180) % 360 - 180) < 15
     assert np.degrees(np.arccos((given @ tilt.matrix.T * LIGHTS).sum(axis=1).clip(-1, 1))).max() < 3
     assert tilt.curl * tilt.left == pytest.approx(
-        curl_of(fitted_normals(observed, mask, LIGHTS), mask), abs=0.02
+        curl_of(fitted_map(observed, mask, LIGHTS), mask), abs=0.02
     )
 
 
 @pytest.mark.parametrize("name", ["bumps", "ball"])
 def test_right_lights_are_not_tilted(name):
     normals, mask = surface(name)
-    tilt = find_tilt(fitted_normals((normals @ LIGHTS.T).clip(0), mask, LIGHTS), mask)
+    tilt = find_tilt(fitted_map((normals @ LIGHTS.T).clip(0), mask, LIGHTS), mask)
     assert tilt.degrees < 3 or tilt.left > 0.9
 
 

@@ -281,7 +281,7 @@ def other_readings(
         if found is not None:
             kind, cause, advice = found
             warning = CaptureWarning(kind, f"{cause} {advice}", error_deg)
-            clear = doubt.is_clear and kind in (codes.NONLINEARITY_SUSPECTED,)
+            clear = doubt.is_clear and kind == codes.NONLINEARITY_SUSPECTED
             yield Finding(warning, after, clear, cause=cause)
         seen = after
 

@@ -27,7 +27,7 @@ from splinecli.judge.judge_net import CLASSES, RIGHT, TRANSLUCENT, features_of, 
 from splinecli.judge.light_check import LightCheck, check_lights
 from splinecli.judge.odd_images import ImageShift, find_shifts
 from splinecli.judge.shading_shifts import moved_back, shading_shifts
-from splinecli.judge.tilt import Tilt, find_tilt, fitted_normals
+from splinecli.judge.tilt import Tilt, find_tilt, fitted_map
 from splinecli.lights.light_fit import Factors, find_factors
 from splinecli.lights.rough_normals import median_turn_deg
 from splinecli.maths import Float64Array, Floats
@@ -208,7 +208,7 @@ class Evidence:
     @cached_property
     def normals(self) -> Floats:
         """The normals (h, w, 3) of a robust fit to the sample."""
-        return fitted_normals(self.evened.observations, self.sample.mask, self.directions)
+        return fitted_map(self.evened.observations, self.sample.mask, self.directions)
 
     @cached_property
     def light_check(self) -> LightCheck:

@@ -17,7 +17,7 @@ import numpy as np
 
 from splinecli.capture.sample import Sample
 from splinecli.judge.explanations import ALL_KINDS, Explanation, Explanations
-from splinecli.judge.tilt import Tilt, curl_of, fitted_normals
+from splinecli.judge.tilt import Tilt, curl_of, fitted_map
 from splinecli.lights.light_fit import Factors
 from splinecli.lights.outline import turn_at_outline
 from splinecli.maths import Float64Array, Floats
@@ -140,7 +140,7 @@ def _of_tilt(seen: Judged) -> list[float]:
     if tilt is None or turn is None:
         return found + [0.0] * 5
     turned = lights @ turn.share(1.0).T
-    curl = curl_of(fitted_normals(coarse.observations, coarse.mask, turned), coarse.mask)
+    curl = curl_of(fitted_map(coarse.observations, coarse.mask, turned), coarse.mask)
     agreement = float(np.median(angle_between_deg(turned, lights @ tilt.matrix.T)))
     return [
         *found,

@@ -15,11 +15,10 @@ import numpy as np
 from scipy.ndimage import binary_erosion, gaussian_filter
 from scipy.spatial.transform import Rotation
 
+from splinecli.lights.rough_normals import fitted_normals
 from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.maths.normals import unit
-from splinecli.maths.robust import fit_robustly, shadow_weights
 
-_FITS = 5
 _GRID_PIXELS, _MAX_PIXELS = 12_000, 1500  # of the grid, and those of it that are used
 _SMOOTHING = 1.0  # standard deviation in pixels of the smoothing of the normals
 _LEAST_Z = 0.34  # slants beyond 70 degrees are left out
@@ -88,14 +87,12 @@ def curl_of(normals: Floats, mask: Bools) -> float:
     return float("nan") if vectors is None else float(_curls(vectors, np.zeros((1, 2)), 0.0).sum())
 
 
-def fitted_normals(observations: Floats, mask: Bools, light_directions: Float64Array) -> Floats:
-    """Return the normals (H, W, 3) that lights (F, 3) give robustly; observations (P, F) are of the
-    pixels of a mask (H, W).
+def fitted_map(observations: Floats, mask: Bools, light_directions: Float64Array) -> Floats:
+    """Return the map of normals (H, W, 3) that lights (F, 3) give robustly; observations (P, F) are
+    of the pixels of a mask (H, W).
     """
-    values = observations.astype(np.float64)
-    values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
     normals = np.zeros((*mask.shape, 3))
-    normals[mask] = unit(fit_robustly(values, shadow_weights(values), light_directions, _FITS)[0])
+    normals[mask] = fitted_normals(observations, light_directions)
     return normals
 
 

@@ -118,11 +118,16 @@ def rough_normals(
 
     Observations are (P, F), at the pixels of a mask (H, W); light directions (F, 3).
     """
+    return smooth_normals(fitted_normals(observations, light_directions), mask)
+
+
+def fitted_normals(observations: Floats, light_directions: Float64Array) -> Float64Array:
+    """Return unit normals (P, 3) of a fit of least absolute deviations to observations (P, F) under
+    lights (F, 3) or (P, F, 3).
+    """
     values = observations.astype(np.float64)
     values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
-    return smooth_normals(
-        fit_robustly(values, shadow_weights(values), light_directions, _FITS)[0], mask
-    )
+    return unit(fit_robustly(values, shadow_weights(values), light_directions, _FITS)[0])
 
 
 def median_turn_deg(
@@ -141,10 +146,8 @@ def median_turn_deg(
     step = max(1, len(observations) // _TURNED_PIXELS)
     normals = []
     for values, directions in ((observations, lights), (others, other_lights)):
-        values = values[::step].astype(np.float64)
-        values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
         own = directions if directions.ndim == 2 else directions[::step]
-        normals.append(unit(fit_robustly(values, shadow_weights(values), own, _FITS)[0]))
+        normals.append(fitted_normals(values[::step], own))
     return float(np.median(angle_between_deg(*normals)))
 
 

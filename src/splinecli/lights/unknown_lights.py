@@ -8,9 +8,7 @@ heights of a surface may be scaled if its lights are lowered or raised with them
 bas-relief ambiguity keeps all shadows (Belhumeur, Kriegman and Yuille, "The bas-relief ambiguity",
 IJCV 1999), but the albedo then changes with the slope.
 
-The outline of the object shows a common rotation of lights and normals. Where a smooth surface
-curves away from the camera, its normals are perpendicular to the view and to the outline. A
-rotation of all lights rotates all normals with them, including the normals at the outline.
+The outline of the object shows a common rotation of lights and normals; see outline.py.
 
 The light network guesses each light from shading, shadows and outline, and predicts the error of
 its guess. The images then refine these guesses: a matte surface under F lights has images of rank 3

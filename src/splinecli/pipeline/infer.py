@@ -38,8 +38,7 @@ from splinecli.recipe.steps import begin, follow, images_to_read
 from splinecli.recipe.work import Work
 from splinecli.records.capture_warnings import (
     EIGHT_BIT,
-    LIGHT_FRAME,
-    LIGHT_ORDER,
+    FAULTS_OF_LIGHTS,
     LIGHTS_TILTED,
     NOT_DISTILLED,
     ROUGH_LIGHTS,
@@ -190,10 +189,9 @@ def estimate_capture(
     prepared = work.made.warnings
     judged = work.judgement.warnings if work.judgement else ()
     remedy = work.judgement.remedy if work.judgement else None
-    mended = set() if remedy is None else {fault.warning.kind for fault in remedy.faults}
-    mended |= {LIGHTS_TILTED}
+    mended = {LIGHTS_TILTED, *(fault.warning.kind for fault in (remedy.faults if remedy else ()))}
     if work.options.keeps_lights:
-        mended -= {LIGHTS_TILTED, LIGHT_FRAME, LIGHT_ORDER}
+        mended -= FAULTS_OF_LIGHTS
     refuse_if_strict([*prepared, *judged], work.made.name, strict=strict, mended=mended)
     capture = follow(work, "refinement", "refinement").made
     if work.options.refine_lights:

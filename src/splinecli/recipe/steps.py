@@ -37,11 +37,9 @@ from splinecli.recipe.work import USUAL, RecipeOptions, Work
 from splinecli.records.capture_warnings import (
     CURVE_MENDED,
     ESTIMATED_INTENSITIES,
+    FAULTS_OF_LIGHTS,
     IMAGES_ALIGNED,
     IMAGES_SHIFTED,
-    LIGHT_FRAME,
-    LIGHT_ORDER,
-    LIGHTS_TILTED,
     NONLINEARITY_SUSPECTED,
     CaptureWarning,
     WarningKind,
@@ -227,7 +225,7 @@ def mend(work: Work, _: Callable[[], object]) -> Work:
         directions = source.light_directions.copy()
         directions[list(work.indices)] = remedy.lights
         source = replace(source, light_directions=directions)
-        why = causes(LIGHT_FRAME, LIGHT_ORDER, LIGHTS_TILTED)
+        why = causes(*FAULTS_OF_LIGHTS)
         notes.append(lights_mended(why, in_files=files is not None))
     if remedy.curve is not None and files is not None and files.radiometry.automatic:
         curve = SRGB if remedy.curve == SRGB_EXPONENT else remedy.curve

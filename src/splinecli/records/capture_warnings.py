@@ -330,6 +330,8 @@ WHITE_LEVEL = WarningKind(
 )
 
 WARNINGS = {kind.code: kind for kind in list(globals().values()) if isinstance(kind, WarningKind)}
+# faults of the light directions that are mended if they are clear
+FAULTS_OF_LIGHTS = frozenset({LIGHT_FRAME, LIGHT_ORDER, LIGHTS_TILTED})
 PROBABLY_WRONG = frozenset(code for code, kind in WARNINGS.items() if kind.is_error)
 # share of saturated observations above which the capture, or an image, carries a warning
 SATURATED_SHARE = 0.01
