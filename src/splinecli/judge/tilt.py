@@ -12,15 +12,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_erosion, gaussian_filter
 from scipy.spatial.transform import Rotation
 
+from splinecli.lights.least_curl import curl_terms, normal_derivatives
 from splinecli.lights.rough_normals import fitted_normals
 from splinecli.maths import Bools, Float64Array, Floats
-from splinecli.maths.normals import unit
 
 _GRID_PIXELS, _MAX_PIXELS = 12_000, 1500  # of the grid, and those of it that are used
-_SMOOTHING = 1.0  # standard deviation in pixels of the smoothing of the normals
 _LEAST_Z = 0.34  # slants beyond 70 degrees are left out
 _LEAST_SHARE = 0.6  # of the pixels that count as given, after a tilt
 _TILTS_DEG, _AZIMUTHS_DEG = (4.0, 8.0, 13.0, 19.0, 26.0, 34.0), np.arange(0.0, 360.0, 20.0)
@@ -97,18 +95,9 @@ def fitted_map(observations: Floats, mask: Bools, light_directions: Float64Array
 
 
 def _derivatives(normals: Floats, mask: Bools) -> Float64Array | None:
-    """Return normals and their derivatives to the right and upwards (3, p, 3), at some pixels with
-    neighbours; None for too few.
-    """
     step = max(1, round(np.sqrt(np.count_nonzero(mask) / _GRID_PIXELS)))
-    mask, normals = mask[::step, ::step], normals[::step, ::step]
-    inside = binary_erosion(mask)
-    if np.count_nonzero(inside) < 50 or min(mask.shape) < 2:
-        return None
-    smooth = unit(gaussian_filter(np.float64(normals), (_SMOOTHING, _SMOOTHING, 0)))
-    downwards, right = np.gradient(smooth, axis=(0, 1))
-    every = -(-np.count_nonzero(inside) // _MAX_PIXELS)
-    return np.stack([each[inside][::every] for each in (smooth, right, -downwards)])
+    part = slice(None, None, step), slice(None, None, step)
+    return normal_derivatives(normals[part], mask[part], most=_MAX_PIXELS)
 
 
 def _around_axis(degrees: float, azimuths_deg: Float64Array) -> Float64Array:
@@ -123,27 +112,6 @@ def _rotations(vectors_deg: Float64Array) -> Float64Array:
 
 
 def _curls(vectors: Float64Array, tilts: Float64Array, least: float) -> Float64Array:
-    """Return the terms (n, p) whose sums are the curl of normals if their lights are tilted back by
-    rotation vectors (n, 2).
-
-    `vectors` (3, p, 3) are normals and their derivatives to the right and upwards. A tilt after
-    which less than the least share of them faces the camera has infinite curl.
-    """
-    normals, right, up = np.einsum("dpi,kij->dkpj", vectors, _rotations(tilts))
-    z = normals[..., 2]
-    counts = z > _LEAST_Z
-    z = np.maximum(z, _LEAST_Z)
-
-    def slope(derivative: Float64Array, axis: int) -> Float64Array:
-        change = normals[..., axis] * derivative[..., 2] - derivative[..., axis] * z
-        return np.asarray(change / z**2)
-
-    p_x, p_y, q_x, q_y = slope(right, 0), slope(up, 0), slope(right, 1), slope(up, 1)
-    curl, size = np.abs(p_y - q_x), np.sqrt(p_x**2 + p_y**2 + q_x**2 + q_y**2)
-    # At edges of the object, both are huge.
-    largest = np.quantile(size, 0.95, axis=1, keepdims=True)
-    weights = counts * z**3
-    found = weights * np.minimum(curl, largest)
-    found /= np.maximum((weights * np.minimum(size, largest)).sum(axis=1, keepdims=True), 1e-12)
-    # Pixels that turn away from the camera must not make a tilt look good.
-    return np.where(counts.mean(axis=1, keepdims=True) >= least, found, np.inf)
+    """Return curl_terms (n, p) if the lights are tilted back by rotation vectors (n, 2)."""
+    back = _rotations(tilts).transpose(0, 2, 1)
+    return curl_terms(vectors, back, least_z=_LEAST_Z, least_share=least)

@@ -68,6 +68,13 @@ def turn_at_outline(
     return OutlineTurn(np.asarray(turn.as_rotvec()), float(np.median(np.abs(residuals[0]))))
 
 
+def is_outlined(mask: Bools) -> bool:
+    """Return whether a mask (H, W) shows the outline of the object, which else extends beyond the
+    image.
+    """
+    return outline_share(mask) >= 0.5
+
+
 def outline_share(mask: Bools) -> float:
     """Return the share of the outer boundary of a mask (H, W) that is not at or near the border of
     the image.

@@ -141,6 +141,7 @@ def find_lights(work: Work, _: Callable[[], object]) -> Work:
     Raises InputError if the images do not determine the lights, or the estimated lights cannot give
     normals.
     """
+    from splinecli.estimate.light_search import search_lights
     from splinecli.lights.unknown_lights import find_lights
 
     capture, options = work.made, work.options
@@ -149,6 +150,7 @@ def find_lights(work: Work, _: Callable[[], object]) -> Work:
             capture.observations,
             capture.mask,
             work.source.intensities_known,
+            search_lights,
             first_light=options.first_light,
             refuse=options.refuses_lights,
         )

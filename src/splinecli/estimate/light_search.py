@@ -1,0 +1,203 @@
+"""Lights for which the network that estimates normals expects the smallest errors, and for which
+its normals have the least curl.
+
+The network was trained under correct lights, on many reflectances. Under wrong lights, the
+observations of a pixel agree with none of these, and it expects larger errors: also on metals and
+glossy surfaces, whose images a matte surface does not explain. The expected error is
+differentiable, so the lights follow its gradient.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from splinecli.estimate.methods import DEFAULT_METHOD
+from splinecli.estimate.networks.spline_net import SplineNet
+from splinecli.estimate.networks.weights import resolve_weights
+from splinecli.lights.least_curl import OPPOSITE, Lights, SearchedLights
+from splinecli.maths import Bools, Float64Array, Floats
+from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.maths.pixel_grid import Blocks
+from splinecli.system.machine import in_order, one_thread_each
+
+_GRID_PIXELS, _MOST_LIGHTS = 500, 30
+_STEPS, _STEP, _OWN_STEP = 14, 0.04, 0.01  # in common, and of each light by itself
+_CURL, _NEAR = (
+    1.5,
+    1.0,
+)  # weights of the curl and of the start, in units of a logarithm of the error
+_CURL_TO_CHOOSE, _GUESS_TO_CHOOSE, _FIRST_TO_CHOOSE = 2.0, 0.3, 0.3
+_LEAST_Z, _LEAST_LIGHT_Z = 0.2, 0.05
+_INTENSITY_SPREAD = 0.3
+
+
+def search_lights(
+    observations: Floats,
+    mask: Bools,
+    starts: Sequence[Lights],
+    guess: Float64Array,
+    guess_errors_deg: Float64Array,
+    errors_deg: Float64Array,
+    *,
+    intensities_known: bool,
+) -> SearchedLights:
+    """Return the best lights near one of the starts.
+
+    The observations (P, F) are linear, divided by the light intensities if these are known. The
+    mask (H, W) has P true pixels, in row-major order. The lights stay near their start, within the
+    errors (F,) in degrees. Another start than the first must be clearly better; the guess (F, 3),
+    with errors of its own, is a weak witness. Bump and hollow are equal.
+    """
+    count = observations.shape[1]
+    used = np.linspace(0, count - 1, min(count, _MOST_LIGHTS)).astype(int)
+    images = _Images.of(observations[:, used], mask)
+    errors = torch.tensor(np.radians(errors_deg[used]), dtype=torch.float32)
+    follow = partial(_follow, images, errors, intensities_known=intensities_known)
+    parts = [Lights(each.directions[used], each.intensities[used]) for each in starts]
+    with one_thread_each() as threads:
+        # as in side_by_side, but with gradients
+        found = [*in_order(follow, parts, threads, lambda: torch.set_num_threads(1))]
+
+    def cost(each: _Followed) -> float:
+        away = np.minimum(
+            *(
+                np.log1p(
+                    (
+                        angle_between_deg(each.lights.directions * sign, guess[used])
+                        / guess_errors_deg[used]
+                    )
+                    ** 2
+                    / 2
+                ).mean()
+                for sign in (1.0, OPPOSITE)
+            )
+        )
+        return float(
+            each.expected + _CURL_TO_CHOOSE * np.log(each.curl + 0.02) + _GUESS_TO_CHOOSE * away
+        )
+
+    costs = np.array([cost(each) for each in found])
+    costs[1:] += _FIRST_TO_CHOOSE
+    best = int(costs.argmin())
+    lights = found[best].lights
+    if len(used) < count:
+        start = starts[best]
+        # The others move with them.
+        move = np.linalg.lstsq(start.directions[used], lights.directions, rcond=None)[0]
+        directions, intensities = unit(start.directions @ move), start.intensities.copy()
+        directions[used], intensities[used] = lights
+        lights = Lights(directions, intensities)
+    return SearchedLights(lights, best, found[best].expected, found[best].curl)
+
+
+class _Followed(NamedTuple):
+    lights: Lights
+    expected: float
+    curl: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Images:
+    """Images on a coarse grid, and the neighbours of its inner pixels."""
+
+    values: Tensor  # (p, F)
+    bright: Tensor  # (p,) bool
+    neighbours: Tensor  # (5, n): the pixels themselves, those right and left, above and below
+
+    @classmethod
+    def of(cls, observations: Floats, mask: Bools) -> _Images:
+        blocks = Blocks.over(mask, _GRID_PIXELS)
+        values = blocks.average(observations, mask)
+        brightest = values.max(axis=1)
+        typical = np.quantile(brightest, 0.99)
+        bright = brightest > 0.05 * typical
+        numbers = np.full(np.add(blocks.mask.shape, 2), -1)
+        numbers[1:-1, 1:-1][blocks.mask] = np.where(bright, np.arange(len(values)), -1)
+        middle = numbers[1:-1, 1:-1]
+        around = (
+            middle,
+            numbers[1:-1, 2:],
+            numbers[1:-1, :-2],
+            numbers[:-2, 1:-1],
+            numbers[2:, 1:-1],
+        )
+        neighbours = np.stack([each.ravel() for each in around])
+        neighbours = neighbours[:, (neighbours >= 0).all(axis=0)]
+        scaled = torch.tensor(values / max(float(typical), 1e-12), dtype=torch.float32)
+        return cls(scaled, torch.from_numpy(bright), torch.from_numpy(neighbours))
+
+    def judge(self, directions: Tensor, log_intensities: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the mean logarithm of the errors that the network expects under lights, and the
+        curl of its normals.
+        """
+        normals, error = _network()(self.values / log_intensities.exp(), directions)
+        expected = error[self.bright, 0].mean()
+        if not self.neighbours.shape[1]:
+            return expected, expected.new_ones(())
+        z = normals[:, 2].clamp(min=_LEAST_Z)
+        slopes = -normals[:, :2] / z[:, None]
+        here, right, left, above, below = self.neighbours
+        p_x, q_x = (slopes[right] - slopes[left]).unbind(1)
+        p_y, q_y = (slopes[above] - slopes[below]).unbind(1)
+        # A root at zero has no gradient.
+        size = (p_x**2 + p_y**2 + q_x**2 + q_y**2 + 1e-8).sqrt()
+        curl = ((p_y - q_x) ** 2 + 1e-8).sqrt()
+        largest = size.detach().quantile(0.95)
+        weights = z[here] ** 3 * (normals[here, 2] > _LEAST_Z)
+        total = (weights * torch.minimum(size, largest)).sum().clamp(min=1e-6)
+        return expected, (weights * torch.minimum(curl, largest)).sum() / total
+
+
+@cache
+def _network() -> SplineNet:
+    """Load the network whose expectations count, in float32. Raises ModelError."""
+    network = resolve_weights(DEFAULT_METHOD).network
+    return network.requires_grad_(False)
+
+
+def _follow(
+    images: _Images, errors: Tensor, start: Lights, *, intensities_known: bool
+) -> _Followed:
+    """Return the best lights on the way of a gradient descent (Adam, Kingma and Ba, ICLR 2015) from
+    a start. All lights move together by a matrix, and each a little by itself.
+    """
+    directions = start.directions.copy()
+    directions[:, 2] = directions[:, 2].clip(min=_LEAST_LIGHT_Z)
+    began = torch.tensor(unit(directions), dtype=torch.float32)
+    common, own = torch.zeros(3, 3, requires_grad=True), torch.zeros_like(began, requires_grad=True)
+    logs = torch.tensor(np.log(start.intensities), dtype=torch.float32)
+    steps = {common: _STEP, own: _OWN_STEP}
+    if not intensities_known:
+        steps[logs.requires_grad_()] = 2 * _OWN_STEP
+    descent = torch.optim.Adam([{"params": [each]} for each in steps], betas=(0.7, 0.9))
+    best, least = _Followed(start, 0.0, 1.0), np.inf
+    for number in range(_STEPS + 1):
+        lights = normalize(began @ (torch.eye(3) + common) + own, dim=1)
+        relative = logs - logs.mean()
+        expected, curl = images.judge(lights, relative)
+        near = torch.log1p(((lights - began) / errors[:, None]).square().sum(dim=1) / 2).mean()
+        near = near + 0.5 * (relative / _INTENSITY_SPREAD).square().mean()
+        low = (_LEAST_LIGHT_Z - lights[:, 2]).clamp(min=0).square().sum()
+        cost = expected + _CURL * (curl + 0.02).log() + _NEAR * near + 100 * low
+        if cost.item() < least:
+            least = cost.item()
+            found = Lights(
+                unit(lights.detach().double().numpy()), relative.detach().double().exp().numpy()
+            )
+            best = _Followed(found, expected.item(), curl.item())
+        if number < _STEPS:
+            share = 0.53 + 0.5 * np.cos(np.pi * number / (_STEPS + 1))
+            for group, step in zip(descent.param_groups, steps.values(), strict=True):
+                group["lr"] = step * share
+            descent.zero_grad()
+            cost.backward()  # type: ignore[no-untyped-call]
+            descent.step()
+    return best
