@@ -290,7 +290,6 @@ def test_umlauts_of_older_programs_and_images_that_are_not_named(folder):
 @pytest.mark.parametrize(
     "name, text, hint",
     [
-        ("../lights.txt", LINES, r"Add --lights .*lights\.txt\."),
         ("dirs.txt", LINES, r"Add --lights .*cat/dirs\.txt\."),
         (
             "TiltSlant.txt",
@@ -347,6 +346,8 @@ def test_one_bad_light_is_left_out(folder, vector):
     with pytest.raises(UsageError, match=r"light 4 was left out"):
         source.places_of([0, 1, 4])
     (folder / "light_directions.txt").write_text("\n".join([*lines[:-1], vector]))
+    assert "2 of 12 images were left out" in str(open_capture(folder).warnings[0])
+    (folder / "light_directions.txt").write_text("\n".join([*lines[:5], *[vector] * 7]))
     with pytest.raises(InputError, match=":5: found a"):
         open_capture(folder)
 
@@ -449,7 +450,7 @@ def test_formats_that_need_an_extra_or_are_not_read(folder, monkeypatch):
         prepare_capture(open_capture(folder))
     for path in folder.glob("*.heic"):
         path.rename(path.with_suffix(".jxl"))
-    with pytest.raises(InputError, match=r"contains no images, but 12 \.jxl files\. PNG,"):
+    with pytest.raises(InputError, match=r"no images, but 12 \.jxl files, 1 \.txt file\. PNG,"):
         open_capture(folder)
     (folder / "a.pgm").write_bytes(b"P5 40 30 255\n" + bytes(100))
     with pytest.raises(InputError, match="the PGM is truncated"):

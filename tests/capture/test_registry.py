@@ -86,7 +86,7 @@ def test_folders_that_are_no_capture(tmp_path):
         (
             "empty",
             Overrides(),
-            r"empty: the folder contains no images\. PNG, TIFF, JPEG, BMP, TGA,",
+            r"empty: the folder contains no images, but 1 \.txt file\. PNG, TIFF, JPEG, BMP,",
         ),
         (
             "dataset",
@@ -96,7 +96,7 @@ def test_folders_that_are_no_capture(tmp_path):
         (
             "dark",
             Overrides(),
-            r"2 images but no light file \(light_directions.txt, .*Pass --lights FILE",
+            r"found 2 images \(.*\) but no light file\. A normal needs .*: light_directions.txt, ",
         ),
         (
             "dark",

@@ -9,11 +9,15 @@ shading.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
+from splinecli.capture.formats.images import ExpectedSize, read_image
 from splinecli.capture.formats.numbers import read_number_rows
 from splinecli.errors import InputError
 from splinecli.maths import Array, Float32Array, Float64Array
@@ -106,3 +110,39 @@ def channel_lights(path: Path | None, n_images: int) -> ChannelLights:
     for each in matrices:
         check_crosstalk(each, path)
     return ChannelLights(matrices, measured=True)
+
+
+_REFERENCE = re.compile(
+    r"(?<![a-z])(ref|reference|background|bg|empty|blank|flat|baseline|no[_-]?contact|untouched)"
+    r"(?![a-z])"
+)
+_FLATTEST = 0.7  # of the gradients of the next flattest picture, at most
+_UNCHANGED = 0.03  # natural logarithm of the largest ratio between equal pixels
+_LEAST_UNCHANGED = 0.3  # share of the pixels that no other photograph changes
+
+
+def find_reference(images: Sequence[Path]) -> Path | None:
+    """Return the picture of a sensor without contact among photographs with it; None if unclear.
+
+    It is the only one with such a name, or else a factor of all others: clearly flatter, and equal
+    to each of them in many pixels, those without contact. Raises InputError if an image cannot be
+    read.
+    """
+    named = [image for image in images if _REFERENCE.search(image.stem.lower())]
+    if named:
+        return named[0] if len(named) == 1 else None
+    logarithms = []
+    for image in images:
+        expected = ExpectedSize(logarithms[0].shape, images[0].name) if logarithms else None
+        smooth = cv2.GaussianBlur(read_image(image, expected), (0, 0), 1.5)
+        logarithms.append(np.log(np.maximum(smooth.reshape(*smooth.shape[:2], -1), 0.02)))
+    slopes = [np.abs(np.diff(each, axis=0)).mean() for each in logarithms]
+    first, second = np.argsort(slopes)[:2].tolist()
+    if slopes[first] > _FLATTEST * slopes[second]:
+        return None
+    for other in logarithms[:first] + logarithms[first + 1 :]:
+        ratio = other - logarithms[first]
+        equal = (np.abs(ratio - np.median(ratio)) < _UNCHANGED).all(axis=2)
+        if equal.mean() < _LEAST_UNCHANGED:
+            return None
+    return images[first]

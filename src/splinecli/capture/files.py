@@ -9,22 +9,23 @@ import re
 import stat
 from collections import Counter
 from collections.abc import Collection, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from splinecli.capture.formats.decoders import RAW_SUFFIXES, page_of, pages
-from splinecli.capture.formats.facts import read_header
-from splinecli.capture.formats.images import cut_out, decode_with_alpha
+from splinecli.capture.formats.film import is_film
+from splinecli.capture.formats.mat import find_stack
 from splinecli.capture.formats.numbers import read_lines, read_text
 from splinecli.errors import InputError
-from splinecli.records.capture_warnings import IMAGES_LEFT_OUT, MASK_CHOICE, CaptureWarning
+from splinecli.maths.robust import MIN_LIGHTS
+from splinecli.records.capture_warnings import CaptureWarning
 from splinecli.records.output_files import FOUND_LIGHTS, PLOTS, own_files
 from splinecli.system.files import (
     check_file,
     file_sha256,
     find_mode,
+    is_folder,
     is_found_file,
     is_substitution,
     reading,
@@ -35,7 +36,7 @@ _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
 _JPEG = (".jpg", ".jpeg")
 # Treated as images only in a folder without others
 _RARE = (".pgm", ".ppm", ".webp", ".avif", ".heic", ".heif")
-PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG)  # suffixes of pictures, such as masks
+PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG, *_RARE)  # suffixes of pictures, such as masks
 _KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # kinds of files of one photograph, best first
 # Suffixes of images of an object
 IMAGE_SUFFIXES = tuple(suffix for suffixes in _KINDS for suffix in suffixes)
@@ -73,6 +74,22 @@ def natural_key(path: Path) -> tuple[list[int | str], str]:
     return [int(part) if place % 2 else part for place, part in parts], path.name
 
 
+# words in the names of pictures that are not photographs
+ROLES = {
+    "mask": re.compile(r"((?<![a-z])m|(?<=[a-z])M)asks?(?![a-z])"),  # also faceMask
+    "ambient": re.compile(r"(?<![a-z])ambient(?![a-z])"),
+}
+
+
+def has_role(path: Path, role: str) -> bool:
+    """Return whether a picture's name has the word "mask" or "ambient", as in NAME_mask.png, and is
+    not the usual name of another file.
+    """
+    if path.suffix.lower() not in PICTURE_SUFFIXES or path.stem.lower() in NOT_PHOTOGRAPHS:
+        return False
+    return any(ROLES[role].search(name) for name in (path.stem, path.stem.lower()))
+
+
 def list_folder(folder: Path) -> list[Path]:
     """Return the folder's content in natural order, without hidden files (macOS writes "._"
     companions of images).
@@ -100,7 +117,8 @@ def list_images(
     Files of one stem show the same photograph. A PNG or TIFF was developed from a RAW file and
     replaces it. A JPEG is treated as a copy made by the camera or a viewer, and ignored. Also
     excluded are files with another role, either by their lower-case stem, such as "mask", or
-    because the user named them.
+    because the user named them, or because their names, but not those of all images, have the word
+    of a role.
     """
     others = {resolve(path) for path in leave_out}
     images = [
@@ -111,7 +129,12 @@ def list_images(
         and is_found_file(entry)
         and resolve(entry) not in others
     ]
-    images = [image for image in images if image.suffix.lower() not in _RARE] or images
+    images = [
+        image for image in images if not any(has_role(image, role) for role in ROLES)
+    ] or images
+    usual = [image for image in images if image.suffix.lower() not in _RARE]
+    if usual and not len(usual) < MIN_LIGHTS <= len(images) - len(usual):
+        images = usual
     rank = {suffix: rank for rank, suffixes in enumerate(_KINDS) for suffix in suffixes}
     best: dict[str, int] = {}
     for image in images:
@@ -122,32 +145,6 @@ def list_images(
     )
 
 
-def copies(images: Sequence[Path]) -> list[CaptureWarning]:
-    """Say which images were left out because another file of the same stem shows the same
-    photograph.
-    """
-    stored = {page_of(image)[0] for image in images}
-    stems = {image.stem.lower() for image in stored}
-    others = [
-        entry
-        for folder in {image.parent for image in stored}
-        for entry in list_folder(folder)
-        if entry.suffix.lower() in IMAGE_SUFFIXES
-        and entry.stem.lower() in stems
-        and entry not in stored
-    ]
-    if not others:
-        return []
-    kinds, used = (
-        ", ".join(sorted({path.suffix.lower() for path in paths})) for paths in (others, stored)
-    )
-    text = (
-        f"{len(others)} files ({kinds}) have the names of other images ({used}): they show the"
-        " same photographs, and"
-    )
-    return [CaptureWarning(IMAGES_LEFT_OUT, f"{text} were left out.")]
-
-
 def check_not_empty(images: Sequence[Path], folder: Path) -> None:
     """Raise NoImagesError for an empty list of images."""
     if not images:
@@ -155,13 +152,18 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
             path.suffix.lower() for path in list_folder(folder) if path.suffix and not path.is_dir()
         )
         found = ", ".join(
-            f"{count} {suffix} files" for suffix, count in suffixes.most_common(3) if count > 2
+            f"{count} {suffix} file{'s' * (count > 1)}" for suffix, count in suffixes.most_common(3)
         )
+        hint = (
+            "PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files are read as"
+            " images, and so is one .mat file with an array H x W x F"
+        )
+        if films := list(filter(is_film, list_folder(folder))):
+            hint = f"A film is given by its own name, as in: splinecli infer {films[0]}"
         raise NoImagesError(
             "the folder contains no images" + (f", but {found}" if found else ""),
             folder,
-            hint="PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files"
-            " are read as images",
+            hint=hint,
         )
 
 
@@ -216,10 +218,42 @@ def find_images(
     if filenames is not None:
         return read_image_list(filenames), True
     images = list_images(folder, leave_out_stems=leave_out_stems, leave_out=leave_out)
+    images = images or list_stack(folder)
     check_not_empty(images, folder)
     if len(images) == 1 and images[0].suffix.lower() in (".tif", ".tiff"):
         images = tuple(pages(images[0]))
     return images, False
+
+
+def list_stack(folder: Path) -> tuple[Path, ...]:
+    """Return the photographs in the only .mat file of a folder with any, such as a.mat[0]; empty
+    for none. Raises InputError for several files.
+    """
+    found, unread = dict[Path, int](), None
+    for path in list_folder(folder):
+        if path.suffix.lower() == ".mat" and path.name.lower() not in GROUND_TRUTH:
+            try:
+                if is_found_file(path) and (stack := find_stack(path)) is not None:
+                    found[path] = stack.count
+            except InputError as error:
+                unread = error
+    if len(found) > 1:
+        raise InputError(
+            f"found {len(found)} .mat files with photographs ({short_list([*found])}), expected"
+            " one",
+            folder,
+            hint="Give each capture a folder of its own",
+        )
+    if unread is not None and not found:
+        raise unread
+    return tuple(
+        path.with_name(f"{path.name}[{n}]") for path, count in found.items() for n in range(count)
+    )
+
+
+def short_list(paths: Sequence[Path], most: int = 3) -> str:
+    """Return the names of the first files for a message."""
+    return ", ".join(path.name for path in paths[:most]) + (", ..." if len(paths) > most else "")
 
 
 @dataclass(frozen=True)
@@ -277,58 +311,6 @@ def find_named(folder: Path, names: Sequence[str]) -> Path | None:
     return next(filter(is_found_file, files), None)
 
 
-_MASK_WORD = re.compile(r"(?<![a-z])mask(?![a-z])")
-
-
-def is_mask_name(path: Path) -> bool:
-    """Return whether a picture's name has the word "mask", as in NAME_mask.png, and is not one of
-    our results.
-    """
-    stem = path.stem.lower()
-    is_picture = path.suffix.lower() in PICTURE_SUFFIXES and stem not in NOT_PHOTOGRAPHS
-    return is_picture and _MASK_WORD.search(stem) is not None
-
-
-def choose_mask(
-    folder: Path, images: Sequence[Path]
-) -> tuple[Path | None, tuple[CaptureWarning, ...]]:
-    """Return a mask for photographs without one of a usual name, and a warning that names it; None
-    if none is found.
-
-    It is the only picture of their size with the word "mask" in its name, in the folder or beside
-    it with the folder's name; or else the alpha channel of the first photograph. If several
-    pictures match, none is chosen.
-    """
-    name, of_images = folder_name(folder).lower(), images[0].parent
-    entries = [*list_folder(folder), *(list_folder(of_images) if of_images != folder else ())]
-    with suppress(InputError):  # we may lack permission to read the parent folder
-        for path in list_folder(folder.absolute().parent):
-            if _MASK_WORD.sub("", path.stem.lower()).strip("._- ") == name:
-                entries.append(path)
-    named = [p for p in entries if is_mask_name(p) and p not in images and is_found_file(p)]
-    try:
-        size = read_header(images[0]).size[0] if named else ()
-        masks = [path for path in named if read_header(path).size[0][:2] == size[:2]]
-        if not named and read_header(images[0]).stated_channels in (2, 4):
-            masks = [images[0]] if cut_out(decode_with_alpha(images[0])[1]) is not None else []
-    except InputError:  # reading the images reports the damage
-        return None, ()
-    if not masks:
-        return None, ()
-    text = f"{masks[0].name} is used as the mask, by its name. Give --mask FILE for another one."
-    if masks[0] in images:
-        text = (
-            f"The alpha channel of {masks[0].name} is used as the mask. Give --mask FILE for"
-            " another one."
-        )
-    if len(masks) > 1:
-        text = (
-            f"{', '.join(path.name for path in masks)}: none is used as the mask. Choose one with"
-            " --mask FILE."
-        )
-    return masks[0] if len(masks) == 1 else None, (CaptureWarning(MASK_CHOICE, text),)
-
-
 def folder_name(folder: Path) -> str:
     """Return the folder's own name, also for ".", ".." and a trailing slash; a link's own name.
     Raises InputError.
@@ -349,7 +331,9 @@ def stamp_files(
     """
     lights = files.light_directions, files.light_intensities
     small = *files.boundaries, *lights, files.mask, files.ground_truth, files.ambient
-    contents = [stamp_content(path) for path in small if path is not None]
+    # a folder of lights stands for the names of its images, which are stamped
+    paths = [path for path in small if path is not None and not is_folder(path)]
+    contents = [stamp_content(page_of(path)[0]) for path in paths]
     return (
         [*contents, *lamps],
         [*map(_path_size_and_time, files.images)],

@@ -15,14 +15,17 @@ from pathlib import Path
 
 from splinecli.capture import files
 from splinecli.capture.formats.film import is_film
-from splinecli.capture.light_files import (
-    FORMATS,
+from splinecli.capture.light_files import FORMATS, read_light_directions
+from splinecli.capture.light_search import (
+    NoLightsError,
     find_light_file,
     light_names,
     light_option,
-    read_light_directions,
+    search_lights,
 )
+from splinecli.capture.roles import choose_mask, copies, pictures_of
 from splinecli.errors import InputError
+from splinecli.maths.robust import MIN_LIGHTS
 from splinecli.records.capture_warnings import CaptureWarning
 from splinecli.system.files import StrPath, is_folder, resolve
 
@@ -140,6 +143,7 @@ def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...
 # The light file of PSBox (Y. Xiong), whose images are in the folder Objects
 _PSBOX_LIGHTS = ("light_directions.txt",)
 # Words in the names of pictures that other programs leave beside the photographs.
+_MORE_IMAGE_FOLDERS = ("image", "imgs", "img", "photos", "photographs", "pictures", "input")
 _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all", "depth"})
 
 
@@ -202,9 +206,24 @@ def _own_name(folder: Path) -> str:
 def _images_folder(folder: Path) -> Path | None:
     """Return the folder of images of a capture without images of its own; None for none."""
     inside = next((path for name in files.IMAGE_FOLDERS if is_folder(path := folder / name)), None)
+    if inside is None and not files.list_images(folder):
+        others = [path for path in _subfolders(folder) if path.name.lower() in _MORE_IMAGE_FOLDERS]
+        inside = others[0] if len(others) == 1 else None
     if inside is None or not all(map(_is_other, files.list_images(folder))):
         return None
     return inside if files.list_images(inside) else None
+
+
+def _holder(folder: Path) -> Path:
+    """Return the folder around a folder of images that has no light file of its own."""
+    around, name = _parent(folder), files.folder_name(folder)
+    if name not in files.IMAGE_FOLDERS and name.lower() not in _MORE_IMAGE_FOLDERS:
+        return folder
+    with suppress(InputError):  # we may lack permission to read the one around
+        inside = _images_folder(around) if find_light_file(folder) is None else None
+        if inside is not None and inside.name == name:
+            return around
+    return folder
 
 
 def find_captures(folder: StrPath) -> list[Path]:
@@ -239,7 +258,8 @@ def _subfolders(folder: Path) -> list[Path]:
 
 def _captures_in(folder: Path) -> list[Path]:
     """Return the folder if it is a capture, or the captures of a CyclesPS object."""
-    if find_light_file(folder) is not None:
+    usual = find_light_file(folder)
+    if usual is not None:
         objects = folder / files.IMAGE_FOLDERS[0]
         is_psbox = is_folder(objects) and files.find_named(folder, _PSBOX_LIGHTS) is not None
         if (
@@ -248,7 +268,13 @@ def _captures_in(folder: Path) -> list[Path]:
             or _images_folder(folder) is not None
         ):
             return [folder]
-    return list_cyclesps(folder) or []
+    captures = list_cyclesps(folder)
+    if captures is None and usual is None:
+        of_images = _images_folder(folder) or folder
+        images = files.list_images(of_images) or files.list_stack(of_images)
+        if len(images) >= MIN_LIGHTS and search_lights(folder, images)[0] is not None:
+            return [folder]
+    return captures or []
 
 
 def _captures_below(folder: Path) -> list[Path]:
@@ -269,6 +295,8 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
 
     A folder with filenames.txt and light_directions.txt has the layout of DiLiGenT (Shi et al.).
     """
+    if overrides.needs_lights and overrides.lights is None:
+        folder = _holder(folder)
     listed = files.find_named(folder, [files.FILENAMES]) is not None
     of_images = folder if listed else _images_folder(folder) or folder
     images, _ = files.find_images(of_images, leave_out=overrides.named())
@@ -279,24 +307,39 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
         others = ()
     images = tuple(image for image in images if image not in others)
     lights = overrides.lights or (find_light_file(folder) if overrides.needs_lights else None)
+    warnings: tuple[CaptureWarning, ...] = ()
     if lights is None and overrides.needs_lights:
-        option = light_option([folder, _parent(folder)], len(images))
+        lights, warnings = search_lights(folder, images)
+    if lights is None and overrides.needs_lights:
+        option = light_option([folder, of_images, _parent(folder)], images)
         hint = (
             "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes"
             " the file from images of a mirror ball. Without one, --lights estimate finds them"
             " from the images, with lower accuracy"
         )
-        raise InputError(
-            f"the folder contains {len(images)} images but no light file ({light_names()})",
+        found = f"1 image ({images[0].name})"
+        if len(images) > 1:
+            found = f"{len(images)} images ({files.short_list(images)})"
+        if len(images) < MIN_LIGHTS:
+            hint = (
+                "A normal needs at least three photographs under different lights; a colour"
+                " photograph under three coloured lamps is read with --lights-in-channels"
+            )
+            hint, option = f"{hint} {option or '--lights FILE'}", None
+        raise NoLightsError(
+            f"found {found} but no light file",
             folder,
-            hint=f"Add {option}" if option else hint,
+            hint=f"Add {option}"
+            if option
+            else f"{hint}. These light files are found by name: {light_names()}",
         )
     layout, ground_truth = "plain folder", files.GROUND_TRUTH
     if listed and files.find_named(folder, ["light_directions.txt"]) is not None:
         # normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
         layout, ground_truth = "DiLiGenT", (*files.GROUND_TRUTH, "normal.txt")
     found = _gather(layout, folder, images, lights, overrides, ground_truth, others)
-    return found if listed else replace(found, warnings=(*found.warnings, *files.copies(images)))
+    of_copies = () if listed else copies(images)
+    return replace(found, warnings=(*warnings, *found.warnings, *of_copies))
 
 
 def _find_psbox(folder: Path, overrides: files.Overrides) -> files.CaptureFiles | None:
@@ -325,11 +368,18 @@ def _gather(
 
     Files named by the user take precedence over files in the folder.
     """
+    beside = [images[0].parent]
+    roles = [path for role in files.ROLES for path in pictures_of(role, beside, images)]
+    named = {resolve(path) for path in overrides.named()}
+    roles = [path for path in roles if resolve(path) not in named]
+    others = tuple(sorted({*others, *roles}, key=files.natural_key))
     mask = overrides.mask or files.find_named(folder, files.MASK)
     warnings: tuple[CaptureWarning, ...] = ()
     if mask is None:
-        mask, warnings = files.choose_mask(folder, images)
-        others = tuple(path for path in others if not warnings or not files.is_mask_name(path))
+        mask, warnings = choose_mask(folder, images)
+        others = tuple(p for p in others if not warnings or not files.has_role(p, "mask"))
+        if mask is None and warnings and not overrides.needs_lights:
+            raise InputError(str(warnings[0]).removesuffix("."), folder)
     return files.CaptureFiles(
         layout,
         _own_name(folder),

@@ -9,25 +9,22 @@ suffix, then by order.
 """
 
 import io
-import re
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
 
 from splinecli.capture import light_formats as readers
 from splinecli.capture import light_rows
-from splinecli.capture.files import LIGHT_POSITIONS, find_named, list_folder
 from splinecli.capture.formats import numbers
 from splinecli.capture.formats.numbers import NumberRows
 from splinecli.capture.light_rows import USUAL_FRAME, LightFrame, RowForm
+from splinecli.capture.lights_in_names import read_names
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Float64Array
+from splinecli.maths import Bools, Float64Array
 from splinecli.maths.normals import unit
-from splinecli.system.files import StrPath, is_found_file
+from splinecli.system.files import StrPath, is_folder
 
 _FILE = "a text file with a line {} for each image"
 
@@ -64,7 +61,7 @@ class LightFormat:
     # in lower case; none for the format of all files with a suffix that no other row has
     suffixes: tuple[str, ...]
     read: Callable[[Path, int | None, RowForm], NumberRows]  # see light_formats
-    # lower-case names of the light file of a folder; "*" stands for any text
+    # names of the light file of a folder, in any case; "*" stands for any text
     found: tuple[str, ...]
     # files of a lower rank are found first. In rank 0, the first name wins; in others, two are an
     # error
@@ -107,7 +104,7 @@ FORMATS = (
         "OpenCV",
         (".yml", ".yaml", ".xml"),
         readers.read_matrix,
-        ("*lightmatrix.yml", "lights.yml"),
+        ("*LightMatrix.yml", "lights.yml"),
         2,
     ),
 )
@@ -119,61 +116,10 @@ def format_of(path: Path) -> LightFormat:
     return next((each for each in FORMATS if path.suffix.lower() in each.suffixes), FORMATS[0])
 
 
-def light_names() -> str:
-    """Return the usual names of light files, for messages."""
-    return f"{', '.join(each.found[0] for each in FORMATS)} or {LIGHT_POSITIONS[0]}"
-
-
 def light_suffixes() -> str:
     """Return the suffixes of light files, for help."""
     suffixes = (suffix for each in FORMATS for suffix in each.suffixes)
     return ", ".join(dict.fromkeys(("text", *suffixes)))
-
-
-def find_light_file(folder: Path) -> Path | None:
-    """Return the light file in the folder; None for none. Raises InputError for several where none
-    is the usual one.
-    """
-    entries = list_folder(folder)
-    for rank in sorted({each.rank for each in FORMATS}):
-        names = [name for each in FORMATS if each.rank == rank for name in each.found]
-        matches = (e for name in names for e in entries if fnmatchcase(e.name.lower(), name))
-        paths = list(filter(is_found_file, matches))
-        if rank and len(paths) > 1:
-            raise InputError(
-                f"found {len(paths)} light files: {', '.join(path.name for path in paths)}",
-                folder,
-                hint="Choose one with --lights FILE",
-            )
-        if paths:
-            return paths[0]
-    return find_named(folder, LIGHT_POSITIONS)
-
-
-def light_option(folders: Sequence[Path], n_images: int) -> str | None:
-    """Return the options that read a file in one of the folders as lights;
-    None for no such file.
-    """
-    suffixes = {".txt", *(suffix for each in FORMATS for suffix in each.suffixes)}
-    longest = min(numbers.MOST_TEXT, 20_000 + 500 * n_images)  # others take seconds to read
-    for folder in folders:
-        with suppress(InputError, OSError):
-            entries = [
-                e for e in list_folder(folder) if e.suffix.lower() in suffixes and is_found_file(e)
-            ]
-            entries.sort(key=lambda e: "light" not in e.name.lower())
-            for path in entries[:50]:
-                name = path.name.lower()
-                is_other = re.search("intens|camera|filenames|lobes", name)
-                if is_other or path.stat().st_size > longest:
-                    continue
-                angles: RowForm = "slant-tilt" if re.search("slant|tilt", name) else "azel"
-                for form in ("xyz", angles):
-                    with suppress(InputError):
-                        read_lights(path, n_images, form=form)
-                        option = f"--lights {path}"
-                        return option if form == "xyz" else f"{option} --light-format {form}"
-    return None
 
 
 def read_light_directions(
@@ -262,6 +208,15 @@ def lights_of(
     )
 
 
+_ENOUGH_ABOVE = 6  # lights above the image plane, from which others are left out
+_LOWEST_Z = 1e-6  # of a light above the plane: rounded angles of 90 degrees have less
+
+
+def above_plane(directions: Float64Array) -> Bools:
+    """Return which of the unit directions (F, 3) are above the image plane."""
+    return np.asarray(directions[:, 2] > _LOWEST_Z)
+
+
 def unit_directions(
     vectors: Float64Array,
     path: Path,
@@ -279,16 +234,15 @@ def unit_directions(
         vectors: of any length.
         places: words for the place of each vector on its line.
         lamps: whether the vectors are positions of lamps, for messages.
-        leave_bad: return a few lights that are zero or below the horizon as they are (z <= 0), for
-            the caller to drop.
+        leave_bad: return lights that are zero or not above the horizon as they are, for the caller
+            to drop, if enough others are left.
     """
     largest = np.abs(vectors).max(axis=1, keepdims=True)
     # First divide by the largest component, because squares of very large or small ones exceed
     # float64's range.
     scaled = np.divide(vectors, largest, out=np.zeros_like(vectors), where=largest > 0)
     directions = unit(scaled)
-    # With so few, the frame is right.
-    if leave_bad and np.count_nonzero(directions[:, 2] <= 0) <= 0.1 * len(directions):
+    if leave_bad and np.count_nonzero(above_plane(directions)) >= _ENOUGH_ABOVE:
         return directions
     for vector, z, line, place in zip(vectors, directions[:, 2], lines, places, strict=True):
         if not vector.any():
@@ -451,12 +405,14 @@ def read_lights(
     path: Path, n_images: int, frame: LightFrame = USUAL_FRAME, form: RowForm = "xyz"
 ) -> tuple[NumberRows, Float64Array]:
     """Return the rows of any light file, which may name their images (see match_images), and their
-    directions (F, 3).
+    directions (F, 3). Of a folder of images, the lights in their names are read.
 
     The frame of a file of AliceVision is relative to its own, which has y down and z away. Raises
-    InputError; see read_light_directions. A few lights below the horizon are left as they are.
+    InputError; see read_light_directions. Lights that are not above the horizon are left as they
+    are if enough others are.
     """
-    table = format_of(path).read(path, n_images, form)
+    read = read_names if is_folder(path) else format_of(path).read
+    table = read(path, n_images, form)
     n_rows = n_images if table.names is None else None
     return table, lights_of(table, n_rows, frame, form, leave_bad=form != "positions")[1]
 

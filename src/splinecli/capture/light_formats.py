@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import Struct, ValidationError, convert, field
 from numpy.typing import NDArray
 
-from splinecli.capture.formats import numbers
+from splinecli.capture.formats import mat, numbers
 from splinecli.capture.formats.numbers import NumberRow, NumberRows, to_number
 from splinecli.capture.light_rows import INTENSITY_RANGE, RowForm, image_name, usable_intensities
 from splinecli.errors import InputError
@@ -161,14 +161,46 @@ def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
 
 
 def _listed(document: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | None:
-    """Return the names and vectors of a list [[x, y, z], ...], or of an object with each image's
-    light by its name.
+    """Return the names and vectors of a list [[x, y, z], ...], of a list of objects, or of an
+    object with each image's light by its name.
     """
-    if isinstance(document, dict) and len(document) == 1 and _vectors(*document.values()):
-        (document,) = document.values()
+    if isinstance(document, dict):
+        lists = [values for values in document.values() if _vectors(values) or _objects(values)]
+        # Lights without names are AliceVision's, in its own frame.
+        if len(lists) == 1 and (_vectors(lists[0]) or "lights" not in document):
+            (document,) = lists
+        elif len(lists) == 1 and (objects := _objects(lists[0])) and objects[0] is not None:
+            return objects
+    if (objects := _objects(document)) is not None:
+        return objects
     names = tuple(image_name(name, []) for name in document) if isinstance(document, dict) else None
     vectors = _vectors(document if names is None else list(document.values()))
     return None if vectors is None else (names, vectors)
+
+
+def _objects(values: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | None:
+    """Return the names and vectors of a list of objects such as {"file": "a.png", "light_dir": [x,
+    y, z]}; None for anything else.
+    """
+    names, vectors = [], list[list[float]]()
+    for each in values if isinstance(values, list) else []:
+        if not isinstance(each, dict):
+            return None
+        found = _vectors([value for value in each.values() if _vectors([value])]) or []
+        found = [vector for vector in found if len(vector) == 3] or _vectors([each]) or []
+        lights = [
+            key for key in each if re.search("light|dir", key, re.I) and _vectors([each[key]])
+        ]
+        if len(found) != 1 and len(lights) == 1:
+            found = _vectors([each[lights[0]]]) or []
+        if len(found) != 1:
+            return None
+        vectors += found
+        words = (each.get(key) for key in each if re.match("file|im|name|path|photo", key, re.I))
+        names += [image_name(word, []) for word in words if isinstance(word, str)][:1]
+    if not vectors or len(names) not in (0, len(vectors)):
+        return None
+    return tuple(names) if names else None, vectors
 
 
 def _vectors(values: Any, keys: str = "xyz") -> list[list[float]] | None:
@@ -213,6 +245,8 @@ _XML = re.compile(
 
 
 _MOST_NAMED = 6  # matrices in a message
+# of a matrix among others, the likeliest first
+_LIGHT_NAMES = ("light_directions", "lightdirs", "light_dirs", "lights", "light", "l", "s")
 
 
 def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
@@ -220,11 +254,12 @@ def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     them from 1.
     """
     suffix = path.suffix.lower()
-    numbers.check_text_length(path, numbers.MOST_TEXT)
+    if suffix != ".mat":  # of which only the matrix is read
+        numbers.check_text_length(path, numbers.MOST_TEXT)
     if suffix == ".npy":
         array = _read_npy(path)
     elif suffix == ".mat":
-        array = numbers.read_matrix(path, lambda shapes: _choose(shapes, path, n_images))
+        array = mat.read_matrix(path, lambda shapes: _choose(shapes, path, n_images))
     else:
         matrices = _read_opencv(path)
         shapes = {name: matrix.shape for name, matrix in matrices.items()}
@@ -248,6 +283,9 @@ def _choose(shapes: Mapping[str, tuple[int, ...]], path: Path, n_images: int | N
     if len(lights) > 1:
         usual = (n_images, 3), (3, n_images)
         lights = {name: shape for name, shape in lights.items() if shape in usual} or lights
+    named = [name for name in lights if name.lower() in _LIGHT_NAMES]
+    if len(lights) > 1 and named and "Dir" not in lights:  # beside S of near_ps, positions
+        return min(named, key=lambda name: _LIGHT_NAMES.index(name.lower()))
     if len(lights) == 1:
         return next(iter(lights))
     sizes = [

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from splinecli.capture.files import LIGHT_POSITIONS, find_named, stamp_content
 from splinecli.capture.formats.numbers import read_lines, read_number_rows, to_number
-from splinecli.capture.light_files import FORMATS, find_light_file, format_of, read_light_positions
+from splinecli.capture.light_files import FORMATS, format_of, read_light_positions
 from splinecli.capture.light_rows import LightFrame, read_light_rows
+from splinecli.capture.light_search import find_light_file
 from splinecli.capture.linearise import Window
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Integers

@@ -10,12 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from splinecli.capture import linearise, near_lamps
-from splinecli.capture.channel_lights import CHANNELS, CROSSTALK, ChannelLights, channel_lights
+from splinecli.capture.channel_lights import (
+    CHANNELS,
+    CROSSTALK,
+    ChannelLights,
+    channel_lights,
+    find_reference,
+)
 from splinecli.capture.files import (
-    AMBIENT,
     CaptureFiles,
     Overrides,
     find_named,
+    short_list,
     stamp_content,
     stamp_files,
 )
@@ -30,12 +36,14 @@ from splinecli.capture.formats.numbers import NumberRows
 from splinecli.capture.layouts import find_capture_files
 from splinecli.capture.light_files import (
     WrongCountError,
+    above_plane,
     match_images,
     read_light_intensities,
     read_lights,
 )
 from splinecli.capture.light_rows import USUAL_FRAME, LightForm, LightFrame, RowForm
 from splinecli.capture.record import placeholders
+from splinecli.capture.roles import find_ambient
 from splinecli.capture.source import CaptureSource
 from splinecli.errors import InputError, UsageError
 from splinecli.images.saturation import check_white_level
@@ -106,22 +114,22 @@ def open_capture(folder: StrPath, options: CaptureOptions = CaptureOptions()) ->
     of_lamps = (*(() if near is None else near.stamp), *of_camera)
     stamp = stamp_files(files, radiometry.flat_field, of_lamps)
     channels, of_channels = _find_channels(files, options)
+    files, reference, of_reference = _find_reference(files, options, form)
+    if reference:
+        radiometry = replace(radiometry, flat_field=reference)
+        stamp = (*stamp, *map(stamp_content, reference))
     if channels is not None:
         stamp = (*stamp, of_channels)
         each = tuple(image for image in files.images for _ in range(CHANNELS))
         files = replace(files, images=each)
     in_folder = files.images
     files, directions, intensities, warnings = _read_all_lights(files, options, form, channels)
-    warnings += files.warnings
-    if len(flats := radiometry.flat_field) > 1:  # in the order of the folder's images
-        each = tuple(dict.fromkeys(in_folder))  # those with three lights once
-        if len(flats) != len(each):
-            problem = f"found {len(flats)} flat-field images, expected 1 or {len(each)}"
-            raise InputError(f"{problem}, one for each image", path=flats[0].parent)
-        flat_of = dict(zip(each, flats, strict=True))
-        radiometry = replace(radiometry, flat_field=tuple(flat_of[image] for image in files.images))
+    warnings += (*files.warnings, *of_reference)
+    radiometry = _with_flat_fields(radiometry, in_folder, files.images)
     if options.are_equal:
         intensities = None
+    elif reference:  # divided by it, the flat surface is equally bright in all channels
+        intensities = np.broadcast_to(1 / directions[:, 2:], directions.shape).copy()
     elif files.light_intensities is not None:
         intensities = _read_intensities(files.light_intensities, files.images, in_folder, channels)
     if channels is not None:
@@ -165,6 +173,23 @@ def open_capture(folder: StrPath, options: CaptureOptions = CaptureOptions()) ->
     )
 
 
+def _with_flat_fields(
+    radiometry: linearise.RadiometricCalibration, in_folder: Sequence[Path], images: Sequence[Path]
+) -> linearise.RadiometricCalibration:
+    """Return the calibration with a flat field for each image, if it has several. Raises
+    InputError.
+    """
+    flats = radiometry.flat_field  # in the order of the folder's images
+    if len(flats) < 2:
+        return radiometry
+    each = tuple(dict.fromkeys(in_folder))  # those with three lights once
+    if len(flats) != len(each):
+        problem = f"found {len(flats)} flat-field images, expected 1 or {len(each)}"
+        raise InputError(f"{problem}, one for each image", path=flats[0].parent)
+    flat_of = dict(zip(each, flats, strict=True))
+    return replace(radiometry, flat_field=tuple(flat_of[image] for image in images))
+
+
 def _find_files(
     folder: Path, options: CaptureOptions
 ) -> tuple[CaptureFiles, near_lamps.LampFiles | None, RowForm]:
@@ -197,8 +222,9 @@ def _find_files(
             hint="Give --pixel-size beside --crop",
         )
     files = find_capture_files(folder, overrides)
-    found = find_named(files.folder, AMBIENT) or find_named(files.images[0].parent, AMBIENT)
-    return replace(files, ambient=options.radiometry.ambient or found), near, form
+    found = find_ambient(files.folder, files.images)
+    others = tuple(path for path in files.others if path != found)
+    return replace(files, ambient=options.radiometry.ambient or found, others=others), near, form
 
 
 def _find_channels(
@@ -211,6 +237,45 @@ def _find_channels(
     if options.crosstalk is not None:
         file = Path(options.crosstalk)
     return channel_lights(file, len(files.images)), None if file is None else stamp_content(file)
+
+
+def _find_reference(
+    files: CaptureFiles, options: CaptureOptions, form: RowForm
+) -> tuple[CaptureFiles, tuple[Path, ...], list[CaptureWarning]]:
+    """Return the files without the picture of a sensor without contact, this picture if it is used
+    as the flat field, and a warning.
+
+    It is looked for if the light file has three lights for each image but one. Raises InputError if
+    it is unclear which image it is.
+    """
+    path, images, given = files.light_directions, files.images, options.radiometry.flat_field
+    if not options.lights_in_channels or path is None or len(images) < 2:
+        return files, (), []
+
+    def is_for(n_images: int) -> bool:
+        with suppress(InputError):
+            rows, _ = read_lights(path, CHANNELS * n_images, options.light_frame, form)
+            return rows.names is None
+        return False
+
+    if is_for(len(images)) or not is_for(len(images) - 1):
+        return files, (), []
+    found = find_reference(images)
+    if found is None:
+        raise InputError(
+            f"found {len(images)} images ({short_list(images)}), but lights for"
+            f" {len(images) - 1} in {path.name}, three for each",
+            files.folder,
+            hint="Move the image without contact into a folder of its own, and give it with"
+            " --flat-field DIR",
+        )
+    files = replace(files, images=tuple(image for image in images if image != found))
+    has_own = find_named(files.folder, (CROSSTALK,)) is not None or options.crosstalk is not None
+    if given or has_own or files.light_intensities is not None or options.intensities is not None:
+        return replace(files, others=(*files.others, found)), (), []
+    text = f"{found.name} is used as the flat field: it shows the sensor without contact."
+    note = CaptureWarning(codes.FLAT_FIELD_CHOICE, f"{text} Give --flat-field DIR for another one.")
+    return files, (found,), [note]
 
 
 def _read_all_lights(
@@ -227,6 +292,8 @@ def _read_all_lights(
             "With --lights-in-channels, the file needs three lines for each image, in the order"
             " R, G, B"
         )
+        if error.n_found == CHANNELS:
+            hint = "Give each image under these three lamps a folder of its own"
         raise InputError(problem, path=error.path, hint=hint) from None
 
 
@@ -295,21 +362,27 @@ def _drop_bad_lights(
     intensities: Float64Array | None,
     warnings: list[CaptureWarning],
 ) -> tuple[CaptureFiles, Float64Array, Float64Array | None, list[CaptureWarning]]:
-    """Return the arguments without the few lights that are zero or below the horizon; see
+    """Return the arguments without lights that are zero or not above the image plane; see
     unit_directions.
     """
-    good = directions[:, 2] > 0
+    good = above_plane(directions)
     if good.all():
         return files, directions, intensities, warnings
+    first = np.flatnonzero(~good)
     bad = ", ".join(
-        f"{files.images[light].name} (z = {directions[light, 2]:.2g})"
-        for light in np.flatnonzero(~good)
+        f"{files.images[light].name} (z = {directions[light, 2]:.2g})" for light in first[:3]
     )
     assert files.light_directions is not None
     text = (
         f"{bad}: left out, because its light in {files.light_directions.name} is not above the"
         " horizon."
     )
+    if len(first) > 1:
+        text = (
+            f"{bad}{', ...' if len(first) > 3 else ''}: {len(first)} of {len(good)} images were"
+            f" left out, because their lights in {files.light_directions.name} are at the image"
+            " plane or behind it. If they are not, the file is in another frame (--light-frame)."
+        )
     warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
     files = replace(
         files,
@@ -332,21 +405,28 @@ def _match_count(
     except InputError as error:
         for key in (_stated_size, lambda image: re.sub(r"\d+", "0", image.name.lower())):
             keys = [key(image) for image in images]
-            usual = Counter(keys).most_common(1)[0][0]
+            (usual, count), *others = Counter(keys).most_common(2)
             alike = tuple(
                 image for image, of_image in zip(images, keys, strict=True) if of_image == usual
             )
-            if len(alike) < len(images):
+            if others and others[0][1] < count:
                 with suppress(InputError):
                     return alike, *read_lights(path, len(alike), frame, form)
-        if not isinstance(error, WrongCountError) or error.n_found >= len(images):
+        if not isinstance(error, WrongCountError):
             raise
-        names = [image.name for image in images[error.n_found :]]
-        hint = (
-            "In this order, it has none for"
-            f" {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
-        )
-        raise WrongCountError(error.problem, path=path, hint=f"{error.hint}. {hint}") from None
+        hint = f"{error.hint}"
+        if error.n_found < len(images):
+            hint += f". In this order, it has none for {short_list(images[error.n_found :])}"
+        if error.n_found in (CHANNELS, CHANNELS * len(images)) and _is_colour(images):
+            hint += (
+                ". If the lights are three coloured lamps that shine at once, add"
+                " --lights-in-channels"
+            )
+        raise WrongCountError(error.problem, path=path, hint=hint) from None
+
+
+def _is_colour(images: Sequence[Path]) -> bool:
+    return (read_header(images[0]).stated_channels or 1) >= CHANNELS
 
 
 def _stated_size(image: Path) -> tuple[int, ...] | None:

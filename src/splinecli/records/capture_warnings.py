@@ -131,6 +131,12 @@ EXIF_ORIENTATION = WarningKind(
     "Make mask and lights for the stored pixels",
 )
 FEW_LIGHTS = WarningKind("few_lights", "There are fewer than eight lights", "Add lights")
+FLAT_FIELD_CHOICE = WarningKind(
+    "flat_field_choice",
+    "With `--lights-in-channels`: a picture of the sensor without contact is used as the flat"
+    " field",
+    "`--flat-field DIR` for another one",
+)
 GRAY_MATERIAL = WarningKind(
     "gray_material", "With `--maps material`: gray images have no base colour, only brightness"
 )
@@ -197,6 +203,12 @@ LIGHT_ORDER = fault(
     "light_order",
     "The order of the lights probably differs from that of the images",
     "Correct the light file",
+)
+LIGHTS_FOUND = WarningKind(
+    "lights_found",
+    "The light directions were read from a file with an unusual name or place, or from the [names"
+    " of the images](light-files.md#lights-in-other-places)",
+    "`--lights FILE` for another file",
 )
 LIGHTS_ILL_CONDITIONED = WarningKind(
     "lights_ill_conditioned",

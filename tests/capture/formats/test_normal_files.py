@@ -10,8 +10,7 @@ import tifffile
 from numpy.testing import assert_allclose, assert_array_equal
 
 from splinecli.capture import read_normal_map
-from splinecli.capture.formats.normal_files import read_ground_truth
-from splinecli.capture.formats.numbers import read_mat
+from splinecli.capture.formats.normal_files import read_ground_truth, read_mat
 from splinecli.errors import InputError
 from splinecli.maths.normals import angle_between_deg, encode_picture, unit
 

@@ -136,15 +136,18 @@ def decode_tiff(file: BinaryIO, path: Path) -> Array | None:
 
 
 _MOST_PAGES = 10_000  # of a TIFF file whose pages are images
-_PAGE = re.compile(r"(.+\.tiff?)\[(\d{1,4})\]", re.IGNORECASE)
+MASK_PAGE = -1  # the number of the mask of a .mat file with photographs
+_PAGE = re.compile(r"(.+\.(?:tiff?|mat))\[(\d{1,4}|mask)\]", re.IGNORECASE)
 
 
 def page_of(path: Path) -> tuple[Path, int]:
-    """Return the file and the number, from 0, of a page as `pages` names it;
-    0 for any other path.
+    """Return the file and the number, from 0, of a picture in it: a page as `pages` names it, or a
+    photograph or the mask of a .mat file, such as a.mat[0] and a.mat[mask]; 0 for any other path.
     """
     found = _PAGE.fullmatch(path.name)
-    return (path, 0) if found is None else (path.with_name(found[1]), int(found[2]))
+    if found is None:
+        return path, 0
+    return path.with_name(found[1]), MASK_PAGE if found[2] == "mask" else int(found[2])
 
 
 def pages(path: Path) -> list[Path]:

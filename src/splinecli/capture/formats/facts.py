@@ -17,7 +17,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
-from splinecli.capture.formats import decoders
+from splinecli.capture.formats import decoders, mat
 from splinecli.errors import InputError
 from splinecli.maths.transfer import BT709, LARGEST_PROFILE, SRGB, TransferCurve, profile_curve
 from splinecli.system.files import check_file, reading
@@ -86,7 +86,7 @@ class ImageHeader:
     """The facts in the header of an image file."""
 
     path: Path
-    kind: str = ""  # "PNG", "JPEG", "TIFF", "BMP", "TGA" or "RAW"; empty for none of them
+    kind: str = ""  # "PNG", "JPEG", "TIFF", "BMP", "TGA", "RAW" or "MAT"; empty for none
     stated_size: StoredSize | None = None  # None for a RAW file, and for a damaged one
     # from cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA
     curve: StatedCurve = StatedCurve()
@@ -142,6 +142,8 @@ def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
         if start[:4] == b"RIFF" or start[4:8] == b"ftyp":
             found = _BRANDS.get(start[8:], found)
         kind = "RAW" if suffix in decoders.RAW_SUFFIXES else found
+        if stored != path and stored.suffix.lower() == ".mat":
+            kind = "MAT"
         if kind is None:
             raise InputError(
                 "found neither PNG, TIFF, JPEG, BMP, PGM, PPM, WebP, AVIF nor HEIC", path
@@ -155,6 +157,8 @@ def facts_in(file: BinaryIO, kind: str, path: Path) -> ImageHeader:
         exif = _exif_tags(lambda tags: tags.load_from_fp(file))
         # The white level is that of developed RAW files; see decode_raw.
         return ImageHeader(path, kind, white_level=65_535, exif=exif)
+    if kind == "MAT":
+        return ImageHeader(path, kind, mat.picture_size(path))
     if kind in PILLOW_KINDS:
         with open_with_pillow(file, kind, path) as picture:
             channels = {"1": 1, "L": 1, "LA": 2, "RGBA": 4}.get(picture.mode, 3)

@@ -21,7 +21,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from splinecli.capture.formats import decoders, facts
+from splinecli.capture.formats import decoders, facts, mat
 from splinecli.errors import InputError
 from splinecli.maths import Array, Bools, Float32Array
 from splinecli.system.files import StrPath
@@ -182,6 +182,9 @@ def _decode(file: BinaryIO, kind: str, path: Path) -> Array:
     """Return the pixels (H, W) or (H, W, C) of an open file of any kind, with alpha."""
     if kind == "RAW":
         return decoders.decode_raw(file.read(), path)
+    if kind == "MAT":
+        check_memory(mat.stack_bytes(path), "the array of all photographs takes", path)
+        return mat.read_picture(path)
     if kind == "TIFF":
         pixels = decoders.decode_tiff(file, path)
         if pixels is not None:

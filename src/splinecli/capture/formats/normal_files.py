@@ -22,13 +22,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from splinecli.capture.formats import images
+from splinecli.capture.formats import images, mat
 from splinecli.capture.formats.decoders import damage_as_input_error, native_stderr
 from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.numbers import (
     MOST_TEXT,
     check_text_length,
-    read_mat,
     read_number_rows,
 )
 from splinecli.errors import InputError
@@ -141,6 +140,33 @@ def _read_vectors(path: Path, expected: images.ExpectedSize | None) -> _Stored:
         values, alpha = images.decode_with_alpha(path, expected)
         images.check_vectors(values.shape, path)
     return _Stored(values, alpha, values.dtype.kind == "u")
+
+
+def read_mat(path: Path, expected: images.ExpectedSize | None) -> Array:
+    """Return the array Normal_gt of a file, or else its only array H x W x 3, with the type that it
+    has in MATLAB.
+
+    Sizes are checked before anything is read or expanded.
+
+    Raises:
+        InputError: the array is missing, too large or not of the expected size.
+        KeyError, ValueError, struct.error, zlib.error: the file is damaged.
+    """
+    with path.open("rb") as file:
+        variables = list(mat.variables(file, path))
+        variable = next((v for v in variables if v.name == "Normal_gt"), None)
+        if variable is None:
+            maps = {v.name: v for v in variables if len(v.shape) == 3 and v.shape[2] == 3}
+            if len(maps) != 1:
+                raise InputError(
+                    "found no Normal_gt, and of other H x W x 3 arrays"
+                    f" {', '.join(maps) or 'none'}, expected one",
+                    path,
+                )
+            (variable,) = maps.values()
+        images.check_vectors(variable.shape, path)
+        images.check_stored_size(variable.shape, 8, path, expected)
+        return mat.numbers_of(file, variable)
 
 
 def _read_text(path: Path, height: int, width: int) -> Float64Array:

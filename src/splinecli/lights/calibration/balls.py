@@ -26,11 +26,13 @@ from splinecli.capture.formats.images import (
     to_linear,
 )
 from splinecli.capture.near_lamps import read_camera_matrix
+from splinecli.capture.roles import choose_mask
 from splinecli.errors import InputError
 from splinecli.lights.calibration.circle import Circle, circle_from_mask, find_circle
 from splinecli.maths import Array, Float32Array, Float64Array
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.pixel_grid import ray_basis
+from splinecli.records.capture_warnings import CaptureWarning
 from splinecli.system.progress import Progress, ignore
 
 # focal length, in pixels, from which a camera is treated as distant: all its rays are nearly
@@ -206,6 +208,7 @@ class BallFiles:
     images: tuple[Path, ...]  # one image for each light, in the order of the lights
     reference: Path | None  # an image that shows the outline of the ball, or None
     mask: Path | None
+    warnings: tuple[CaptureWarning, ...] = ()  # the choice of the mask
 
     @cached_property
     def facts(self) -> tuple[ImageHeader, ...]:
@@ -253,17 +256,14 @@ def find_ball_files(folder: Path, mask: Path | None = None) -> BallFiles:
         capture_files.NOT_PHOTOGRAPHS | set(REFERENCES),
         () if mask is None else (mask,),
     )
-    images, listed = capture_files.find_images(
-        folder, leave_out_stems=not_lights, leave_out=leave_out
-    )
-    photographs = tuple(path for path in images if not capture_files.is_mask_name(path))
-    if not listed and 2 * len(photographs) > len(images):  # others are such as chrome.mask.tga
-        images = photographs
+    images, _ = capture_files.find_images(folder, leave_out_stems=not_lights, leave_out=leave_out)
     others = capture_files.list_images(folder, leave_out_stems=(), leave_out=images)
     reference = next((path for path in others if path.stem.lower() in REFERENCES), None)
     mask = mask or capture_files.find_named(folder, capture_files.MASK)
-    mask = mask or capture_files.choose_mask(folder, images)[0]
-    return BallFiles(folder, images, reference, mask)
+    warnings: tuple[CaptureWarning, ...] = ()
+    if mask is None:
+        mask, warnings = choose_mask(folder, images)
+    return BallFiles(folder, images, reference, mask, warnings)
 
 
 def calibrate_ball(

@@ -1,0 +1,181 @@
+"""Find the lights of a capture: by the usual names of light files, in the folders where people keep
+them, and in the names of the images.
+"""
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from fnmatch import fnmatchcase
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+
+from splinecli.capture.files import (
+    LIGHT_POSITIONS,
+    find_named,
+    folder_name,
+    list_folder,
+    list_images,
+    short_list,
+)
+from splinecli.capture.formats import numbers
+from splinecli.capture.formats.decoders import page_of
+from splinecli.capture.light_files import FORMATS, match_images, read_lights
+from splinecli.capture.light_rows import RowForm
+from splinecli.capture.lights_in_names import lights_in_names
+from splinecli.errors import InputError
+from splinecli.maths import Float64Array
+from splinecli.records.capture_warnings import LIGHTS_FOUND, CaptureWarning
+from splinecli.system.files import is_folder, is_found_file
+
+_SUFFIXES = {".txt", *(suffix for each in FORMATS for suffix in each.suffixes)}
+_OTHER_FILES = re.compile("intens|camera|filenames|lobes|position|calibration|normal")
+_LIGHTS = r"(.*[^a-z])?light(s|ing)?[^a-z]*(dirs?|directions?|vec(tor)?s?|sources?|matrix)?[^a-z]*"
+_LIGHT_FOLDER = re.compile(rf"{_LIGHTS}|lamps?|leds?|lp")
+_MOST_FILES = 50  # of a folder that are tried
+
+
+class NoLightsError(InputError):
+    """No lights of a capture are found."""
+
+
+def light_names() -> str:
+    """Return all names of light files that are found, for messages."""
+    names = [name for each in FORMATS for name in each.found]
+    return f"{', '.join(names)} or {LIGHT_POSITIONS[0]}"
+
+
+def find_light_file(folder: Path) -> Path | None:
+    """Return the light file in the folder; None for none. Raises InputError for several where none
+    is the usual one.
+    """
+    for rank, group in groupby(_usual(folder), lambda found: found[0]):
+        paths = [path for _, path in group if is_found_file(path)]
+        if rank and len(paths) > 1:
+            raise InputError(
+                f"found {len(paths)} light files: {', '.join(path.name for path in paths)}",
+                folder,
+                hint="Choose one with --lights FILE",
+            )
+        if paths:
+            return paths[0]
+    return find_named(folder, LIGHT_POSITIONS)
+
+
+def _usual(folder: Path) -> Iterator[tuple[int, Path]]:
+    """Yield the entries of a folder with usual names of light files, each with its rank, in order
+    of precedence.
+    """
+    entries = list_folder(folder)
+    for rank in sorted({each.rank for each in FORMATS}):
+        for name in (name for each in FORMATS if each.rank == rank for name in each.found):
+            yield from ((rank, e) for e in entries if fnmatchcase(e.name.lower(), name.lower()))
+
+
+def search_lights(
+    folder: Path, images: Sequence[Path]
+) -> tuple[Path | None, tuple[CaptureWarning, ...]]:
+    """Return the lights of a capture without a usual light file, and a warning that says which they
+    are: a light file that fits its images, or their folder if their names contain lights; None for
+    none.
+
+    The file is in the folder, in one called Lights inside it or beside it, or in the folder around
+    it. Raises InputError if several files there fit and differ.
+    """
+    stored, of_images = page_of(images[0])[0], images[0].parent
+    if stored.suffix.lower() == ".mat" and _fit(stored, images) is not None:
+        return stored, ()
+    for place in _places(folder, of_images):
+        fits = [(path, fit) for path in place if (fit := _fit(path, images)) is not None]
+        if not all(by_order for _, (by_order, _) in fits):
+            fits = [(path, fit) for path, fit in fits if not fit[0]]
+        if not fits:
+            continue
+        path, (_, lights) = fits[0]
+        if not all(np.array_equal(lights, other, equal_nan=True) for _, (_, other) in fits):
+            raise InputError(
+                f"found {len(fits)} files that may be its lights: "
+                + short_list([each for each, _ in fits]),
+                path.parent,
+                hint="Choose one with --lights FILE",
+            )
+        text = f"The light directions were read from {path}. Give --lights FILE for others."
+        return path, (CaptureWarning(LIGHTS_FOUND, text),)
+    if (named := lights_in_names(images)) is not None:
+        text = (
+            f"The light directions were read from the names of the images: {named[1]}. Give"
+            " --lights FILE for others."
+        )
+        return of_images, (CaptureWarning(LIGHTS_FOUND, text),)
+    return None, ()
+
+
+def _places(folder: Path, of_images: Path) -> Iterator[list[Path]]:
+    """Yield the files of each place that may be light files, the nearest first."""
+    yield [path for each in dict.fromkeys((folder, of_images)) for path in _likely(each)]
+    above = folder.absolute().parent
+    with suppress(InputError):  # we may lack permission to read the folder above
+        for around in dict.fromkeys((folder, of_images, above)):
+            named = [e for e in list_folder(around) if _LIGHT_FOLDER.fullmatch(e.name.lower())]
+            folders = [each for each in named if is_folder(each) and not list_images(each)]
+            yield [path for each in folders for path in _candidates(each)]
+        name, files = folder_name(folder).lower(), _candidates(above)
+        yield [path for path in files if path.stem.lower() == name] or _likely(above)
+
+
+def _likely(folder: Path) -> list[Path]:
+    """Return the files of a folder whose names are those of light files."""
+    usual = {path for _, path in _usual(folder)}
+    files = _candidates(folder)
+    return [p for p in files if p in usual or re.fullmatch(_LIGHTS, p.stem.lower())]
+
+
+def _candidates(folder: Path) -> list[Path]:
+    """Return the files of a folder with suffixes of light files, without those of other names."""
+    files = [
+        path
+        for path in list_folder(folder)
+        if path.suffix.lower() in _SUFFIXES
+        and not _OTHER_FILES.search(path.name.lower())
+        and is_found_file(path)
+    ]
+    return sorted(files, key=lambda path: "light" not in path.name.lower())[:_MOST_FILES]
+
+
+def _fit(
+    path: Path, images: Sequence[Path], form: RowForm = "xyz"
+) -> tuple[bool, Float64Array] | None:
+    """Return whether a file names its images, but other ones, and its lights (F, 3) in the order of
+    the images, with NaN for images without one; None if it does not fit them.
+    """
+    longest = min(numbers.MOST_TEXT, 20_000 + 500 * len(images))  # others take seconds to read
+    with suppress(InputError, OSError):
+        if path.suffix.lower() != ".mat" and path.stat().st_size > longest:
+            return None
+        for count in (len(images), 3 * len(images)):  # each channel may have a light
+            with suppress(InputError):
+                table, directions = read_lights(path, count, form=form)
+                if table.names is None:
+                    return False, directions
+                chosen, how = match_images(table, images)
+                lights = np.full((len(images), 3), np.nan)
+                lights[[images.index(image) for image in chosen]] = directions
+                return how == "order", lights
+    return None
+
+
+def light_option(folders: Sequence[Path], images: Sequence[Path]) -> str | None:
+    """Return the options that read a file in one of the folders as lights;
+    None for no such file.
+    """
+    for folder in folders:
+        with suppress(InputError, OSError):
+            for path in _candidates(folder):
+                is_slant = re.search("slant|tilt", path.name.lower())
+                angles: RowForm = "slant-tilt" if is_slant else "azel"
+                for form in ("xyz", angles):
+                    if _fit(path, images, form) is not None:
+                        option = f"--lights {path}"
+                        return option if form == "xyz" else f"{option} --light-format {form}"
+    return None
