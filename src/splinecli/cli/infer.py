@@ -155,8 +155,8 @@ def watch(context: Context, options: WatchOptions) -> None:
     infer.invoke(run)  # refuses wrong options now, not when the first capture arrives
     arrivals = Arrivals(folder, marker=options.marker, seconds=options.settle, without=output)
     messages = Messages(quiet=given["quiet"])
-    messages.say(f"{folder}: waiting for captures; Ctrl-C ends")
     ready, is_there = arrivals.take(), True
+    messages.say(f"{folder}: waiting for captures; Ctrl-C ends")
     while True:
         if ready:
             run.params["captures"] = ready

@@ -1,12 +1,15 @@
 """Calibrate lights: images of balls and of a gray target in, light files and a report out."""
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
 from splinecli.capture.channel_lights import CROSSTALK
 from splinecli.capture.light_files import read_light_directions, rows_text
 from splinecli.capture.linearise import RadiometricCalibration
+from splinecli.errors import InputError
 from splinecli.lights.calibration.balls import (
+    BallCalibration,
     BallFiles,
     CalibratedLights,
     calibrate_ball,
@@ -46,11 +49,8 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
     """
     with held_folder(options.output, observer.warn):
         check_free(options.output, OUTPUT_FILES, overwrite=options.overwrite)
-        target = options.gray_ball or options.gray_card
         # Report a wrong path now, not only after all images have been read.
-        target_files = None if target is None else find_ball_files(target)
-        masks = options.masks or [None] * len(options.balls)
-        balls = [find_ball_files(*pair) for pair in zip(options.balls, masks, strict=True)]
+        balls, target_files = _find_files(options, observer)
         known = None
         if options.compare is not None:
             known = read_light_directions(options.compare, len(balls[0].images))
@@ -60,6 +60,7 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
                 calibrate_ball(ball, circle, options.camera_matrix, advance)
                 for ball, circle in zip(balls, circles or [None] * len(balls), strict=True)
             ]
+        _check_outlines(calibrated, options)
         lights = combine_balls(calibrated)
         intensities = crosstalk = None
         warnings: list[str] = []
@@ -96,6 +97,37 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
         for warning in report["warnings"]:
             observer.warn(warning)
         return report
+
+
+def _find_files(
+    options: CalibrateOptions, observer: Observer
+) -> tuple[list[BallFiles], BallFiles | None]:
+    """Return the files of the balls, and of the gray target if there is one. Raises InputError."""
+    target = options.gray_ball or options.gray_card
+    target_files = None if target is None else find_ball_files(target)
+    masks = options.masks or [None] * len(options.balls)
+    balls = [find_ball_files(*pair) for pair in zip(options.balls, masks, strict=True)]
+    for files in (*balls, *filter(None, [target_files])):
+        for warning in files.warnings:
+            observer.warn(f"{files.folder}: {warning}")
+    return balls, target_files
+
+
+def _check_outlines(balls: Sequence[BallCalibration], options: CalibrateOptions) -> None:
+    """Write the picture and raise InputError if an outline may not be that of a ball."""
+    for ball in balls:
+        if ball.doubt is None:
+            continue
+        with new_files(options.output, report=None) as new:
+            new.write(PICTURE, calibration_picture([ball]))
+        circle = ball.circle
+        raise InputError(
+            f"the circle in the images (centre {circle.x:.0f}, {circle.y:.0f}, radius"
+            f" {circle.radius:.0f} pixels) may not be the ball's edge: {ball.doubt}",
+            ball.files.folder,
+            hint=f"{options.output / PICTURE} shows it. Give the ball's circle with --circle X,Y,R,"
+            " or a mask with --mask FILE, and add --overwrite",
+        )
 
 
 def _measure_target(

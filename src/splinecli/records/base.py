@@ -12,6 +12,7 @@ import types
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, is_dataclass
+from difflib import get_close_matches
 from functools import lru_cache, partial
 from math import isfinite
 from pathlib import Path
@@ -82,8 +83,9 @@ class Option:
             names = tuple(item.strip() for item in given.split(",") if item.strip())
             for name in names:
                 if name not in self.items:
+                    near = get_close_matches(name, self.items, 1) or list(self.items)
                     problem = f"{title} has {name!r}; expected a list of {', '.join(self.items)}"
-                    raise UsageError(f"{problem}, such as {next(iter(self.items))}")
+                    raise UsageError(f"{problem}, such as {near[0]}")
             if not names:
                 raise UsageError(f"{title} is empty; expected a list of {', '.join(self.items)}")
             return names

@@ -62,6 +62,13 @@ _KEPT = (*_EXPOSURE, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA402, 0xA403, 0xA405)
 _MOST_PARTS = 10_000
 
 
+_FORMATS = "PNG, TIFF, JPEG, BMP, PGM, PPM, WebP, AVIF"
+
+
+class UnknownFormatError(InputError):
+    """A file is not an image of a known format."""
+
+
 @dataclass(frozen=True)
 class StatedCurve:
     """The transfer curve that a file states."""
@@ -145,9 +152,7 @@ def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
         if stored != path and stored.suffix.lower() == ".mat":
             kind = "MAT"
         if kind is None:
-            raise InputError(
-                "found neither PNG, TIFF, JPEG, BMP, PGM, PPM, WebP, AVIF nor HEIC", path
-            )
+            raise UnknownFormatError(f"found neither {_FORMATS} nor HEIC", path)
         yield file, kind
 
 

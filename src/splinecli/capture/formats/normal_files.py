@@ -24,7 +24,7 @@ import numpy as np
 
 from splinecli.capture.formats import images, mat
 from splinecli.capture.formats.decoders import damage_as_input_error, native_stderr
-from splinecli.capture.formats.facts import read_header
+from splinecli.capture.formats.facts import UnknownFormatError, read_header
 from splinecli.capture.formats.numbers import (
     MOST_TEXT,
     check_text_length,
@@ -137,7 +137,11 @@ def _read_vectors(path: Path, expected: images.ExpectedSize | None) -> _Stored:
             images.check_stored_size(array.shape, array.dtype.itemsize, path, expected)
             values = np.array(array)
     else:
-        values, alpha = images.decode_with_alpha(path, expected)
+        try:
+            values, alpha = images.decode_with_alpha(path, expected)
+        except UnknownFormatError as error:
+            problem = error.problem.replace("neither", "neither .npy, .mat,")
+            raise InputError(problem, path) from None
         images.check_vectors(values.shape, path)
     return _Stored(values, alpha, values.dtype.kind == "u")
 

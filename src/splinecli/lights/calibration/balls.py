@@ -28,7 +28,12 @@ from splinecli.capture.formats.images import (
 from splinecli.capture.near_lamps import read_camera_matrix
 from splinecli.capture.roles import choose_mask
 from splinecli.errors import InputError
-from splinecli.lights.calibration.circle import Circle, circle_from_mask, find_circle
+from splinecli.lights.calibration.circle import (
+    Circle,
+    circle_from_mask,
+    find_circles,
+    is_in,
+)
 from splinecli.maths import Array, Float32Array, Float64Array
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.pixel_grid import ray_basis
@@ -229,6 +234,7 @@ class BallCalibration:
     normals: Float64Array
     view: View
     shape: tuple[int, ...]  # (H, W) of the images
+    doubt: str | None = None  # why the outline may be that of something else than a mirror ball
 
     @property
     def points(self) -> Float64Array:
@@ -285,10 +291,11 @@ def calibrate_ball(
         InputError: an image cannot be read, has another size or shows no highlight; or the outline
             is not found or not entirely inside the image.
     """
-    circle, circle_from = _find_outline(files) if circle is None else (circle, "--circle")
+    circles, circle_from = _find_outline(files) if circle is None else ([circle], "--circle")
+    circle = circles[0]
     view = find_view(files.facts[0], camera_matrix)
     centre = ball_centre(circle.outline, view.matrix)
-    highlights, normals, directions = [], [], []
+    highlights, normals, directions, n_agreeing = [], [], [], 0
     shape = files.facts[0].size[0][:2]
     for path in files.images:
         stored = decode_image(path, ExpectedSize(shape, files.images[0].name))
@@ -298,9 +305,9 @@ def calibrate_ball(
             )
         try:
             full_scale = 1.0 if stored.dtype.kind == "u" else None
-            highlight = find_highlight(
-                to_linear(stored, path).mean(axis=2), circle, full_scale=full_scale
-            )
+            gray = to_linear(stored, path).mean(axis=2)
+            highlight = find_highlight(gray, circle, full_scale=full_scale)
+            n_agreeing += circle_from == "picture" and is_in(gray, circle)
             point = np.array([(highlight.x, highlight.y)])
             normal, direction = reflect(centre, point, view.matrix)
             if not direction[0] @ unit_rays(point, view.matrix)[0] < 0:
@@ -316,7 +323,38 @@ def calibrate_ball(
         directions.append(direction[0])
         progress(1)
     found = (tuple(highlights), np.array(directions), np.array(normals))
-    return BallCalibration(files, circle, circle_from, *found, view, shape)
+    doubt = None
+    if circle_from == "picture":
+        doubt = _doubt(circles, np.array([(each.x, each.y) for each in highlights]), n_agreeing)
+    return BallCalibration(files, circle, circle_from, *found, view, shape, doubt)
+
+
+_LEAST_VISIBLE = 0.6  # share of the outline of a ball that is found in a picture
+_SMALLER = 0.8  # of the radius, at most: another circle that may be the ball
+_CLEAR = 0.7  # share of the outline from which a smaller circle may be the ball
+_LEAST_MOTION = 0.02  # of the radius, between the highlights of most images and their median
+
+
+def _doubt(circles: Sequence[Circle], highlights: Float64Array, n_agreeing: int) -> str | None:
+    """Return why the first of the circles in a picture may not be the edge of a mirror ball with
+    these highlights (F, 2); None for no doubt.
+    """
+    ball, n_images = circles[0], len(highlights)
+    if ball.visible < _LEAST_VISIBLE:
+        return f"the image has edges along only {100 * ball.visible:.0f} % of the circle"
+    if 2 * n_agreeing < n_images:
+        return f"only {n_agreeing} of {n_images} images show the circle"
+    for other in circles[1:]:
+        around = np.hypot(*(highlights - (other.x, other.y)).T).max() < other.radius
+        if around and other.radius < _SMALLER * ball.radius and other.visible > _CLEAR:
+            return (
+                f"a smaller one (centre {other.x:.0f}, {other.y:.0f}, radius"
+                f" {other.radius:.0f} pixels) is clear, too, and contains all highlights"
+            )
+    moved = np.hypot(*(highlights - np.median(highlights, axis=0)).T)
+    if n_images > 2 and np.median(moved) < _LEAST_MOTION * ball.radius:
+        return "the highlight stays in its place in most images"
+    return None
 
 
 def combine_balls(balls: Sequence[BallCalibration]) -> CalibratedLights:
@@ -336,23 +374,26 @@ def combine_balls(balls: Sequence[BallCalibration]) -> CalibratedLights:
     return CalibratedLights(tuple(balls), directions, np.where(len(balls) > 1, disagreement, 0.0))
 
 
-def _find_outline(files: BallFiles) -> tuple[Circle, str]:
-    """Return the outline of the ball and its source: "mask" or "picture"."""
+def _find_outline(files: BallFiles) -> tuple[list[Circle], str]:
+    """Return the circles that may be the outline of the ball, the likeliest first, and their
+    source: "mask" or "picture".
+    """
     path = files.mask or files.reference or files.images[0]
     try:
         if files.mask is not None:
             expected = ExpectedSize(files.facts[0].size[0], files.images[0].name, "a mask")
             mask = read_mask(files.mask, expected)
-            circle, source, shape = circle_from_mask(mask), "mask", mask.shape
+            circles, source, shape = [circle_from_mask(mask)], "mask", mask.shape
         else:
             first, *others = files.images if files.reference is None else [files.reference]
             gray: Float32Array = read_image(first).mean(axis=2)
             for image in others:
                 gray = gray + read_image(image, ExpectedSize(gray.shape, first.name)).mean(axis=2)
             gray = gray / np.float32(1 + len(others))
-            circle, source, shape = find_circle(gray), "picture", gray.shape
+            circles, source, shape = find_circles(gray), "picture", gray.shape
     except InputError as error:
         raise InputError(error.problem, path=error.path or path, hint=error.hint) from None
+    circle = circles[0]
     if circle.reaches_beyond(shape):
         ball = (
             f"the ball (centre {circle.x:.0f}, {circle.y:.0f}, radius {circle.radius:.0f} pixels)"
@@ -363,4 +404,4 @@ def _find_outline(files: BallFiles) -> tuple[Circle, str]:
             hint="Take images of the whole ball; if this is not the ball, give its circle with"
             " --circle X,Y,R",
         )
-    return circle, source
+    return circles, source

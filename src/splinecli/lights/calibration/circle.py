@@ -22,6 +22,7 @@ _MIN_VISIBLE = 0.35
 _SEARCH_BAND = 0.06
 # of the radius: the largest distance from the circle at which a point agrees with it
 _TOLERANCE = 0.015
+_SAME = 0.03  # of the radius: the largest difference of equal circles in two images
 
 
 @dataclass(frozen=True)
@@ -101,16 +102,19 @@ def find_circle(image: Array) -> Circle:
 
     Raises InputError if no clear circle is found.
     """
-    values = image.astype(np.float32)
-    # Many images show a dark ball in front of a dark background. Clipping the brightest 1 % brings
-    # out its edge.
-    values = np.sqrt(values / max(float(np.quantile(values, 0.99)), 1e-9)).clip(0, 1)
+    return find_circles(image)[0]
+
+
+def find_circles(image: Array) -> list[Circle]:
+    """Return the clear circles in a gray image (H, W), the likeliest ball first. Raises InputError
+    if there are none.
+    """
+    values = _brightened(image)
     scale = 480 / max(values.shape)  # the Hough transform searches an image of this longer side
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     small = cv2.resize(values, None, fx=scale, fy=scale, interpolation=interpolation)
     small = cv2.GaussianBlur(small, (0, 0), 1.5)
-    best: Circle | None = None
-    highest = 0.0
+    refined = []
     for stretch in (1.0, 4.0):
         found = cv2.HoughCircles(
             (255 * (stretch * small).clip(0, 1)).astype(np.uint8),
@@ -126,21 +130,34 @@ def find_circle(image: Array) -> Circle:
         for x, y, radius in found[0, :12].tolist() if found is not None else ():
             # Pixel centres are at whole numbers in both images, so their corners differ by half a
             # pixel.
-            circle = _refine(
-                values, Circle((x + 0.5) / scale - 0.5, (y + 0.5) / scale - 0.5, radius / scale)
-            )
-            # Reflections in the ball are circles, too. Of two equally visible circles, the larger
-            # one is the ball.
-            merit = 0.0 if circle is None else circle.visible * math.sqrt(circle.radius)
-            if merit > highest:
-                best, highest = circle, merit
-    if best is None:
+            guess = Circle((x + 0.5) / scale - 0.5, (y + 0.5) / scale - 0.5, radius / scale)
+            refined.append(_refine(values, guess))
+    circles = [circle for circle in refined if circle is not None]
+    if not circles:
         hint = (
             "Is this a folder of images of a mirror ball? If so, give a mask of the ball with"
             " --mask, or its circle"
         )
         raise InputError("found no circle, expected a ball", hint=f"{hint} with --circle X,Y,R")
-    return best
+    # Reflections in the ball are circles, too. Of two equally visible circles, the larger one is
+    # the ball.
+    return sorted(circles, key=lambda each: -each.visible * math.sqrt(each.radius))
+
+
+def is_in(image: Array, circle: Circle) -> bool:
+    """Return whether the edges in a gray image (H, W) confirm a circle."""
+    found = _refine(_brightened(image), circle)
+    if found is None:
+        return False
+    differences = found.x - circle.x, found.y - circle.y, found.radius - circle.radius
+    return max(map(abs, differences)) < _SAME * circle.radius
+
+
+def _brightened(image: Array) -> Float32Array:
+    values = image.astype(np.float32)
+    # Many images show a dark ball in front of a dark background. Clipping the brightest 1 % brings
+    # out its edge.
+    return np.sqrt(values / max(float(np.quantile(values, 0.99)), 1e-9)).clip(0, 1)
 
 
 def _refine(values: Float32Array, guess: Circle) -> Circle | None:
