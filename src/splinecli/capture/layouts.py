@@ -374,6 +374,7 @@ def _gather(
     roles = [path for path in roles if resolve(path) not in named]
     others = tuple(sorted({*others, *roles}, key=files.natural_key))
     mask = overrides.mask or files.find_named(folder, files.MASK)
+    mask = mask or files.find_named(images[0].parent, files.MASK)
     warnings: tuple[CaptureWarning, ...] = ()
     if mask is None:
         mask, warnings = choose_mask(folder, images)

@@ -34,6 +34,12 @@ class WrongCountError(InputError):
 
     n_found = 0
 
+    def with_hint(self, hint: str) -> "WrongCountError":
+        """Return the same error with another hint."""
+        error = WrongCountError(self.problem, self.path, hint=hint)
+        error.n_found = self.n_found
+        return error
+
 
 def _read_text(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     meaning = light_rows.COLUMNS[form]
@@ -195,7 +201,7 @@ def lights_of(
     if form in ("azel", "slant-tilt"):
         light_rows.check_angles(table, form)
         vectors = light_rows.directions_from_angles(vectors, form)
-    vectors = vectors @ frame.matrix.T + 0.0  # no -0
+    vectors = vectors @ frame.matrix.T + frame.origin  # which also turns -0 into 0
     lines = [table.rows[2 if transposed else light].line for light in range(len(vectors))]
     place = " in column " if transposed else " as light "
     places = [

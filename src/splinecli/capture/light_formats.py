@@ -244,6 +244,7 @@ _XML = re.compile(
 )
 
 
+NEAR_PS = frozenset({"S", "Dir"})  # positions and axes of lamps in a light.mat of near_ps
 _MOST_NAMED = 6  # matrices in a message
 # of a matrix among others, the likeliest first
 _LIGHT_NAMES = ("light_directions", "lightdirs", "light_dirs", "lights", "light", "l", "s")
@@ -259,11 +260,11 @@ def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     if suffix == ".npy":
         array = _read_npy(path)
     elif suffix == ".mat":
-        array = mat.read_matrix(path, lambda shapes: _choose(shapes, path, n_images))
+        array = mat.read_matrix(path, lambda shapes: _choose(shapes, path, n_images, form))
     else:
         matrices = _read_opencv(path)
         shapes = {name: matrix.shape for name, matrix in matrices.items()}
-        array = matrices[_choose(shapes, path, n_images)]
+        array = matrices[_choose(shapes, path, n_images, form)]
     is_matrix = array.ndim == 2 and array.dtype.kind in "fiu" and array.size
     if not is_matrix or not np.isfinite(array).all():
         raise InputError(
@@ -275,7 +276,9 @@ def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
     return NumberRows(path, tuple(NumberRow(tuple(row), line) for line, row in rows))
 
 
-def _choose(shapes: Mapping[str, tuple[int, ...]], path: Path, n_images: int | None) -> str:
+def _choose(
+    shapes: Mapping[str, tuple[int, ...]], path: Path, n_images: int | None, form: RowForm
+) -> str:
     """Return the name of the matrix N x 3 or 3 x N, of several the one that has a light for each
     image.
     """
@@ -284,7 +287,9 @@ def _choose(shapes: Mapping[str, tuple[int, ...]], path: Path, n_images: int | N
         usual = (n_images, 3), (3, n_images)
         lights = {name: shape for name, shape in lights.items() if shape in usual} or lights
     named = [name for name in lights if name.lower() in _LIGHT_NAMES]
-    if len(lights) > 1 and named and "Dir" not in lights:  # beside S of near_ps, positions
+    if set(lights) >= NEAR_PS and form == "positions":
+        return "S"
+    if len(lights) > 1 and named and not set(lights) >= NEAR_PS:
         return min(named, key=lambda name: _LIGHT_NAMES.index(name.lower()))
     if len(lights) == 1:
         return next(iter(lights))

@@ -47,6 +47,8 @@ class LightFrame:
     signs: tuple[int, int, int] = (1, 1, 1)
     # whether the file has y before x. The signs belong to x and y in either order
     exchanged: bool = False
+    # of the file's origin, for positions of lamps
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def matrix(self) -> Float64Array:

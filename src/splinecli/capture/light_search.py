@@ -87,16 +87,13 @@ def search_lights(
     if stored.suffix.lower() == ".mat" and _fit(stored, images) is not None:
         return stored, ()
     for place in _places(folder, of_images):
-        fits = [(path, fit) for path in place if (fit := _fit(path, images)) is not None]
-        if not all(by_order for _, (by_order, _) in fits):
-            fits = [(path, fit) for path, fit in fits if not fit[0]]
+        fits = {path: lights for path in place if (lights := _fit(path, images)) is not None}
         if not fits:
             continue
-        path, (_, lights) = fits[0]
-        if not all(np.array_equal(lights, other, equal_nan=True) for _, (_, other) in fits):
+        path, *_ = fits
+        if not all(np.array_equal(fits[path], other, equal_nan=True) for other in fits.values()):
             raise InputError(
-                f"found {len(fits)} files that may be its lights: "
-                + short_list([each for each, _ in fits]),
+                f"found {len(fits)} files that may be its lights: {short_list([*fits])}",
                 path.parent,
                 hint="Choose one with --lights FILE",
             )
@@ -120,8 +117,10 @@ def _places(folder: Path, of_images: Path) -> Iterator[list[Path]]:
             named = [e for e in list_folder(around) if _LIGHT_FOLDER.fullmatch(e.name.lower())]
             folders = [each for each in named if is_folder(each) and not list_images(each)]
             yield [path for each in folders for path in _candidates(each)]
-        name, files = folder_name(folder).lower(), _candidates(above)
-        yield [path for path in files if path.stem.lower() == name] or _likely(above)
+        name, entries = folder_name(folder).lower(), list_folder(above)
+        others = {each.name.lower() for each in entries if is_folder(each)} - {name}
+        own = [path for path in _candidates(above) if path.stem.lower() == name]
+        yield own or [path for path in _likely(above) if path.stem.lower() not in others]
 
 
 def _likely(folder: Path) -> list[Path]:
@@ -144,10 +143,13 @@ def _candidates(folder: Path) -> list[Path]:
 
 
 def _fit(
-    path: Path, images: Sequence[Path], form: RowForm = "xyz"
-) -> tuple[bool, Float64Array] | None:
-    """Return whether a file names its images, but other ones, and its lights (F, 3) in the order of
-    the images, with NaN for images without one; None if it does not fit them.
+    path: Path, images: Sequence[Path], form: RowForm = "xyz", *, by_order: bool = False
+) -> Float64Array | None:
+    """Return the lights (F, 3) of a file in the order of the images, with NaN for images without
+    one; None if it does not fit them.
+
+    Args:
+        by_order: whether it may name other images.
     """
     longest = min(numbers.MOST_TEXT, 20_000 + 500 * len(images))  # others take seconds to read
     with suppress(InputError, OSError):
@@ -157,11 +159,13 @@ def _fit(
             with suppress(InputError):
                 table, directions = read_lights(path, count, form=form)
                 if table.names is None:
-                    return False, directions
+                    return directions
                 chosen, how = match_images(table, images)
+                if how == "order" and not by_order:
+                    return None
                 lights = np.full((len(images), 3), np.nan)
                 lights[[images.index(image) for image in chosen]] = directions
-                return how == "order", lights
+                return lights
     return None
 
 
@@ -175,7 +179,7 @@ def light_option(folders: Sequence[Path], images: Sequence[Path]) -> str | None:
                 is_slant = re.search("slant|tilt", path.name.lower())
                 angles: RowForm = "slant-tilt" if is_slant else "azel"
                 for form in ("xyz", angles):
-                    if _fit(path, images, form) is not None:
+                    if _fit(path, images, form, by_order=True) is not None:
                         option = f"--lights {path}"
                         return option if form == "xyz" else f"{option} --light-format {form}"
     return None

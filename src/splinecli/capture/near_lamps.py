@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,18 +17,19 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.capture.files import LIGHT_POSITIONS, find_named, stamp_content
-from splinecli.capture.formats.numbers import read_lines, read_number_rows, to_number
+from splinecli.capture.files import LIGHT_POSITIONS, find_named, list_folder, stamp_content
+from splinecli.capture.formats.mat import names, read_matrix
+from splinecli.capture.formats.numbers import NumberRow, read_lines, read_number_rows, to_number
 from splinecli.capture.light_files import FORMATS, format_of, read_light_positions
-from splinecli.capture.light_rows import LightFrame, read_light_rows
+from splinecli.capture.light_rows import LightFrame, read_light_rows, usable_intensities
 from splinecli.capture.light_search import find_light_file
 from splinecli.capture.linearise import Window
 from splinecli.errors import InputError, UsageError
-from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Integers
+from splinecli.maths import Array, Bools, Float32Array, Float64Array, Floats, Integers
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.pixel_grid import bounds, ray_basis
 from splinecli.records.capture_warnings import LAMP_DISTANCE, NEAR_LAMPS, CaptureWarning
-from splinecli.system.files import is_substitution
+from splinecli.system.files import is_found_file, is_substitution
 
 
 @dataclass(frozen=True, eq=False)
@@ -404,6 +406,8 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
     positions, used = _path(options.positions), True
     if positions is None and options.distance is None:
         positions, used = find_named(folder, LIGHT_POSITIONS), lights is None
+        if positions is None and used and find_light_file(folder) is None:
+            positions = next(filter(is_near_ps, list_folder(folder)), None)
         if positions is None and lights is not None and lights.is_file():
             positions = find_named(lights.parent, LIGHT_POSITIONS)
         if positions is None:
@@ -417,15 +421,21 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
     pixel_file = None if scaled else _find("pixel_size.txt", folder, positions)
     scaled = scaled or pixel_file is not None
     lobes = _find("light_lobes.txt", folder, positions)
+    if lobes is None and positions is not None and is_near_ps(positions):
+        lobes = positions
     stamp = tuple(map(stamp_content, filter(None, (positions, pixel_file, lobes))))
     pixel_size = options.pixel_size if pixel_file is None else _read_pixel_size(pixel_file)
-    if used and not scaled and positions in (find_light_file(folder), _path(options.positions)):
-        raise InputError(
-            "the scale of the lamp positions is unknown",
-            positions,
-            hint="Give --pixel-size or --object-width,"
-            " or write the width of a pixel into pixel_size.txt",
+    only = find_light_file(folder), _path(options.positions), lobes
+    if used and not scaled and positions in only:
+        hint = (
+            "Give --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
         )
+        if positions == lobes:
+            hint = (
+                "Give --pixel-size: the distance from the camera to the object, divided by the"
+                " focal length in pixels (K(1,1) in camera.mat)"
+            )
+        raise InputError("the scale of the lamp positions is unknown", positions, hint=hint)
     return LampFiles(positions, options, pixel_size, lobes, stamp, used and scaled)
 
 
@@ -439,6 +449,8 @@ def find_camera(
     """
     beside = None if lamps is None else lamps.positions
     path = _path(options.camera_matrix) or _find("camera_matrix.txt", folder, beside)
+    if path is None and beside is not None and is_near_ps(beside):
+        path = find_named(beside.parent, ["camera.mat"])
     if path is None:
         return None, ()
     stamp = stamp_content(path)  # before it is read
@@ -450,8 +462,11 @@ def _path(name: str | None) -> Path | None:
 
 
 def read_camera_matrix(path: Path) -> Float64Array:
-    """Return the camera matrix (3, 3) of a text file. Raises InputError."""
-    matrix = read_number_rows(path).as_array()
+    """Return the camera matrix (3, 3) of a text file, or K of a .mat file. Raises InputError."""
+    if path.suffix.lower() == ".mat":
+        matrix = np.float64(_matrix_of(path, "K"))
+    else:
+        matrix = read_number_rows(path).as_array()
     if matrix.shape != (3, 3):
         raise InputError(
             f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3",
@@ -467,7 +482,11 @@ def _read_lobes(path: Path, positions: Float64Array, frame: LightFrame) -> Float
     hint = (
         "A line has the direction in which a lamp shines most, x y z, and its exponent mu, 0 to 100"
     )
-    rows = read_number_rows(path).rows
+    if is_near_ps(path):
+        columns = np.column_stack((_rows_of(path, "Dir"), _rows_of(path, "mu", 1)))
+        rows = tuple(NumberRow(tuple(row), None) for row in columns.tolist())
+    else:
+        rows = read_number_rows(path).rows
     if len(rows) not in (1, len(positions)):
         raise InputError(
             f"found {len(rows)} lines, expected 1 or {len(positions)}", path, hint=hint
@@ -489,6 +508,67 @@ def _read_lobes(path: Path, positions: Float64Array, frame: LightFrame) -> Float
             hint="The directions point from the lamps to the object",
         )
     return lobes
+
+
+def is_near_ps(path: Path) -> bool:
+    """Return whether a file is a light.mat of near_ps (Y. Quéau): positions S and axes Dir of
+    lamps, in the frame of OpenCV's camera.
+    """
+    with suppress(InputError):
+        return path.suffix.lower() == ".mat" and is_found_file(path) and {"S", "Dir"} <= names(path)
+    return False
+
+
+def _matrix_of(path: Path, name: str) -> Array:
+    def choose(shapes: dict[str, tuple[int, ...]]) -> str:
+        if name not in shapes:
+            raise InputError(f"found no matrix {name}", path)
+        return name
+
+    return read_matrix(path, choose)
+
+
+def _rows_of(path: Path, name: str, n_columns: int = 3) -> Float64Array:
+    """Return a matrix (F, n_columns) of a .mat file, which may also be transposed."""
+    matrix = np.asarray(_matrix_of(path, name), np.float64)
+    return matrix if matrix.shape[1] == n_columns else matrix.T
+
+
+def near_ps_frame(
+    lamps: LampFiles, camera_matrix: Float64Array | None, shape: Sequence[int]
+) -> LightFrame:
+    """Return the frame of the positions of near_ps over images of this shape (H, W).
+
+    Raises InputError without a camera matrix or a pixel size.
+    """
+    if camera_matrix is None or lamps.pixel_size is None:
+        raise InputError(
+            "found positions relative to the camera, expected its matrix and the size of a pixel",
+            lamps.positions,
+            hint="Give --camera-matrix and --pixel-size",
+        )
+    (fx, _, cx), (_, fy, cy), _ = camera_matrix
+    distance = lamps.pixel_size * fx
+    x = distance * (cx - (shape[1] - 1) / 2) / fx
+    y = distance * ((shape[0] - 1) / 2 - cy) / fy
+    return LightFrame((1, -1, -1), origin=(float(x), float(y), float(distance)))
+
+
+def near_ps_intensities(path: Path, frame: LightFrame) -> Float64Array | None:
+    """Return the light (F, 3) of the lamps of near_ps at the origin, from their Phi; None without
+    it. Raises InputError.
+    """
+    if "Phi" not in names(path):
+        return None
+    towards = _rows_of(path, "S") @ frame.matrix.T + frame.origin
+    flux = np.asarray(_matrix_of(path, "Phi"), np.float64)
+    flux = flux if len(flux) == len(towards) else flux.T
+    distances = np.linalg.norm(towards, axis=1, keepdims=True)
+    lobes = _read_lobes(path, towards, frame)
+    values = flux / distances**2 * _within_lobes(lobes, (towards / distances)[None]).T
+    if values.shape[1] not in (1, 3) or not usable_intensities(values).all():
+        raise InputError(f"found Phi of shape {flux.shape}, expected positive numbers F x 1", path)
+    return np.broadcast_to(values, towards.shape).copy()
 
 
 def _read_pixel_size(path: Path) -> float:

@@ -113,6 +113,7 @@ def open_capture(folder: StrPath, options: CaptureOptions = CaptureOptions()) ->
     camera_matrix, of_camera = near_lamps.find_camera(Path(folder), near, options.lamps)
     of_lamps = (*(() if near is None else near.stamp), *of_camera)
     stamp = stamp_files(files, radiometry.flat_field, of_lamps)
+    options, of_near_ps = _with_near_ps(files, options, near, camera_matrix)
     channels, of_channels = _find_channels(files, options)
     files, reference, of_reference = _find_reference(files, options, form)
     if reference:
@@ -126,12 +127,11 @@ def open_capture(folder: StrPath, options: CaptureOptions = CaptureOptions()) ->
     files, directions, intensities, warnings = _read_all_lights(files, options, form, channels)
     warnings += (*files.warnings, *of_reference)
     radiometry = _with_flat_fields(radiometry, in_folder, files.images)
-    if options.are_equal:
-        intensities = None
-    elif reference:  # divided by it, the flat surface is equally bright in all channels
+    if reference:  # divided by it, the flat surface is equally bright in all channels
         intensities = np.broadcast_to(1 / directions[:, 2:], directions.shape).copy()
-    elif files.light_intensities is not None:
-        intensities = _read_intensities(files.light_intensities, files.images, in_folder, channels)
+    if of_near_ps is not None:
+        intensities = of_near_ps
+    intensities = _given_intensities(files, options, in_folder, channels, intensities)
     if channels is not None:
         warnings.append(CaptureWarning(codes.LIGHTS_IN_CHANNELS, channels.in_words()))
     if files.light_directions is not None and form == "xyz" and near is None:
@@ -171,6 +171,23 @@ def open_capture(folder: StrPath, options: CaptureOptions = CaptureOptions()) ->
         # Omitted if they are not given, so that earlier stamps stay valid.
         stamp=(*stamp, *decoded, *given_level),
     )
+
+
+def _with_near_ps(
+    files: CaptureFiles,
+    options: CaptureOptions,
+    near: near_lamps.LampFiles | None,
+    camera_matrix: Float64Array | None,
+) -> tuple[CaptureOptions, Float64Array | None]:
+    """Return the options with the frame of the lamps if their file is one of near_ps, and their
+    light intensities. Raises InputError.
+    """
+    path = None if near is None or not near.used else near.positions
+    if near is None or path is None or not near_lamps.is_near_ps(path):
+        return options, None
+    shape = read_header(files.images[0]).size[0]
+    frame = near_lamps.near_ps_frame(near, camera_matrix, shape)
+    return replace(options, light_frame=frame), near_lamps.near_ps_intensities(path, frame)
 
 
 def _with_flat_fields(
@@ -422,7 +439,7 @@ def _match_count(
                 ". If the lights are three coloured lamps that shine at once, add"
                 " --lights-in-channels"
             )
-        raise WrongCountError(error.problem, path=path, hint=hint) from None
+        raise error.with_hint(hint) from None
 
 
 def _is_colour(images: Sequence[Path]) -> bool:
@@ -432,6 +449,23 @@ def _is_colour(images: Sequence[Path]) -> bool:
 def _stated_size(image: Path) -> tuple[int, ...] | None:
     size = read_header(image).stated_size
     return None if size is None else size[0][:2]
+
+
+def _given_intensities(
+    files: CaptureFiles,
+    options: CaptureOptions,
+    in_folder: Sequence[Path],
+    channels: ChannelLights | None,
+    found: Float64Array | None,
+) -> Float64Array | None:
+    """Return the intensities (F, 3) as options and files give them, or else those that are found
+    with the lights; None for none.
+    """
+    if options.are_equal:
+        return None
+    if files.light_intensities is None:
+        return found
+    return _read_intensities(files.light_intensities, files.images, in_folder, channels)
 
 
 def _read_intensities(

@@ -12,7 +12,7 @@ import re
 import struct
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
@@ -60,21 +60,48 @@ class Variable(NamedTuple):
     compressed: bool
 
 
+def names(path: Path) -> set[str]:
+    """Return the names of the arrays in a file. Raises InputError."""
+    with damage_as_input_error(path, *_DAMAGED), path.open("rb") as file:
+        return {variable.name for variable in variables(file, path)}
+
+
 def read_matrix(path: Path, choose: Callable[[dict[str, tuple[int, ...]]], str]) -> Array:
     """Return the numeric matrix of a small file whose name is chosen from the shapes by name.
 
-    Only this one is expanded. Raises InputError, also those of `choose`.
+    Vectors with numbered names, such as l1 and l2, are also a matrix, with one in each row. Only
+    the chosen matrix is expanded. Raises InputError, also those of `choose`.
     """
-    with (
-        damage_as_input_error(path, *_DAMAGED),
-        path.open("rb") as file,
-    ):
+    with damage_as_input_error(path, *_DAMAGED), path.open("rb") as file:
         found = {
-            v.name: v
+            v.name: [v]
             for v in variables(file, path)
             if len(v.shape) == 2 and 0 < math.prod(v.shape) <= 1 << 20
         }
-        return numbers_of(file, found[choose({name: v.shape for name, v in found.items()})])
+        for (stem, shape), group in _numbered(v for (v,) in found.values()).items():
+            if min(shape) == 1:
+                found[f"{stem}1..{len(group)}"] = group
+        shapes = {
+            name: group[0].shape if len(group) == 1 else (len(group), max(group[0].shape))
+            for name, group in found.items()
+        }
+        chosen = [numbers_of(file, variable) for variable in found[choose(shapes)]]
+        return chosen[0] if len(chosen) == 1 else np.stack([vector.ravel() for vector in chosen])
+
+
+def _numbered(found: Iterable[Variable]) -> dict[tuple[str, tuple[int, ...]], list[Variable]]:
+    """Return at least three variables of equal shapes and numbered names, in order, by the stem of
+    their names and their shape.
+    """
+    groups = defaultdict(list)
+    for variable in found:
+        if name := re.fullmatch(r"(\D*)(\d{1,4})", variable.name):
+            groups[name[1], variable.shape].append((int(name[2]), variable))
+    return {
+        key: [variable for _, variable in sorted(group)]
+        for key, group in groups.items()
+        if len(group) >= 3
+    }
 
 
 def numbers_of(file: BinaryIO, variable: Variable) -> Array:
@@ -201,14 +228,9 @@ def _find_stack(path: Path, *_: int) -> Stack | None:
         usual = variable.name.lower() in _PICTURES
         if axes is not None and (usual or variable.shape[2:] != (3,)):  # such as normals
             stacks.append((not usual, Stack((variable,), axes, None)))
-    numbered = defaultdict(list)
-    for variable in found:
-        if (name := re.fullmatch(r"(\D*)(\d{1,4})", variable.name)) and min(variable.shape[:2]) > 3:
-            numbered[name[1], variable.shape].append((int(name[2]), variable))
-    for (_, shape), group in numbered.items():
-        if len(group) >= 3 and (len(shape) == 2 or shape[2:] == (3,)):
-            arrays = tuple(variable for _, variable in sorted(group))
-            stacks.append((False, Stack(arrays, "HWC"[: len(shape)], None)))
+    for (_, shape), group in _numbered(found).items():
+        if min(shape[:2]) > 3 and (len(shape) == 2 or shape[2:] == (3,)):
+            stacks.append((False, Stack(tuple(group), "HWC"[: len(shape)], None)))
     stacks = [each for each in stacks if each[0] == min(unusual for unusual, _ in stacks)]
     if len(stacks) != 1:
         return None
