@@ -100,7 +100,11 @@ def list_folder(folder: Path) -> list[Path]:
     if mode is None:
         raise InputError("the folder does not exist", folder)
     if not stat.S_ISDIR(mode):
-        raise InputError("found a file, expected a folder of images", folder)
+        raise InputError(
+            "found a file, expected a folder of images",
+            folder,
+            hint=f"Give the folder around it, {folder.parent}",
+        )
     with reading(folder, "folder"):
         entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
         return sorted(entries, key=natural_key)
@@ -156,7 +160,7 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
         )
         hint = (
             "PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files are read as"
-            " images, and so is one .mat file with an array H x W x F"
+            " images, and so is one .mat file with a numeric array H x W x F"
         )
         if films := list(filter(is_film, list_folder(folder))):
             hint = f"A film is given by its own name, as in: splinecli infer {films[0]}"

@@ -19,6 +19,7 @@ from splinecli.capture.light_files import FORMATS, read_light_directions
 from splinecli.capture.light_search import (
     NoLightsError,
     find_light_file,
+    has_lights,
     light_names,
     light_option,
     search_lights,
@@ -143,7 +144,6 @@ def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...
 # The light file of PSBox (Y. Xiong), whose images are in the folder Objects
 _PSBOX_LIGHTS = ("light_directions.txt",)
 # Words in the names of pictures that other programs leave beside the photographs.
-_MORE_IMAGE_FOLDERS = ("image", "imgs", "img", "photos", "photographs", "pictures", "input")
 _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all", "depth"})
 
 
@@ -206,9 +206,11 @@ def _own_name(folder: Path) -> str:
 def _images_folder(folder: Path) -> Path | None:
     """Return the folder of images of a capture without images of its own; None for none."""
     inside = next((path for name in files.IMAGE_FOLDERS if is_folder(path := folder / name)), None)
-    if inside is None and not files.list_images(folder):
-        others = [path for path in _subfolders(folder) if path.name.lower() in _MORE_IMAGE_FOLDERS]
-        inside = others[0] if len(others) == 1 else None
+    if inside is None and not files.list_images(folder) and has_lights(folder):
+        others = [
+            path for path in _subfolders(folder) if len(files.list_images(path)) >= MIN_LIGHTS
+        ]
+        inside = others[0] if len(others) == 1 and not has_lights(others[0]) else None
     if inside is None or not all(map(_is_other, files.list_images(folder))):
         return None
     return inside if files.list_images(inside) else None
@@ -216,12 +218,10 @@ def _images_folder(folder: Path) -> Path | None:
 
 def _holder(folder: Path) -> Path:
     """Return the folder around a folder of images that has no light file of its own."""
-    around, name = _parent(folder), files.folder_name(folder)
-    if name not in files.IMAGE_FOLDERS and name.lower() not in _MORE_IMAGE_FOLDERS:
-        return folder
+    around = _parent(folder)
     with suppress(InputError):  # we may lack permission to read the one around
-        inside = _images_folder(around) if find_light_file(folder) is None else None
-        if inside is not None and inside.name == name:
+        inside = None if has_lights(folder) else _images_folder(around)
+        if inside is not None and inside.name == files.folder_name(folder):
             return around
     return folder
 
@@ -295,6 +295,7 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
 
     A folder with filenames.txt and light_directions.txt has the layout of DiLiGenT (Shi et al.).
     """
+    name = _own_name(folder)
     if overrides.needs_lights and overrides.lights is None:
         folder = _holder(folder)
     listed = files.find_named(folder, [files.FILENAMES]) is not None
@@ -339,7 +340,7 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
         layout, ground_truth = "DiLiGenT", (*files.GROUND_TRUTH, "normal.txt")
     found = _gather(layout, folder, images, lights, overrides, ground_truth, others)
     of_copies = () if listed else copies(images)
-    return replace(found, warnings=(*warnings, *found.warnings, *of_copies))
+    return replace(found, name=name, warnings=(*warnings, *found.warnings, *of_copies))
 
 
 def _find_psbox(folder: Path, overrides: files.Overrides) -> files.CaptureFiles | None:

@@ -19,7 +19,13 @@ from numpy.typing import NDArray
 
 from splinecli.capture.formats import mat, numbers
 from splinecli.capture.formats.numbers import NumberRow, NumberRows, to_number
-from splinecli.capture.light_rows import INTENSITY_RANGE, RowForm, image_name, usable_intensities
+from splinecli.capture.light_rows import (
+    INTENSITY_RANGE,
+    RowForm,
+    directions_from_angles,
+    image_name,
+    usable_intensities,
+)
 from splinecli.errors import InputError
 from splinecli.maths import Float64Array
 from splinecli.records.base import Positive
@@ -182,6 +188,8 @@ def _objects(values: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | 
     """Return the names and vectors of a list of objects such as {"file": "a.png", "light_dir": [x,
     y, z]}; None for anything else.
     """
+    if isinstance(values, dict) and all(isinstance(each, dict) for each in values.values()):
+        values = [{"file": name, **each} for name, each in values.items()]
     names, vectors = [], list[list[float]]()
     for each in values if isinstance(values, list) else []:
         if not isinstance(each, dict):
@@ -193,6 +201,8 @@ def _objects(values: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | 
         ]
         if len(found) != 1 and len(lights) == 1:
             found = _vectors([each[lights[0]]]) or []
+        if not found and (angles := _vectors([each], ("azimuth", "elevation"))) is not None:
+            found = directions_from_angles(np.array(angles), "azel").tolist()
         if len(found) != 1:
             return None
         vectors += found
@@ -203,7 +213,7 @@ def _objects(values: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | 
     return tuple(names) if names else None, vectors
 
 
-def _vectors(values: Any, keys: str = "xyz") -> list[list[float]] | None:
+def _vectors(values: Any, keys: Sequence[str] = "xyz") -> list[list[float]] | None:
     """Return lists of two numbers or more, or objects with these keys, as lists of numbers; None
     for anything else.
     """

@@ -97,30 +97,43 @@ def search_lights(
                 path.parent,
                 hint="Choose one with --lights FILE",
             )
-        text = f"The light directions were read from {path}. Give --lights FILE for others."
-        return path, (CaptureWarning(LIGHTS_FOUND, text),)
+        return path, _found(path)
+    for path in _candidates(folder):  # of any name, if they name the images
+        if _fit(path, images, named=True) is not None:
+            return path, _found(path)
     if (named := lights_in_names(images)) is not None:
-        text = (
-            f"The light directions were read from the names of the images: {named[1]}. Give"
-            " --lights FILE for others."
-        )
-        return of_images, (CaptureWarning(LIGHTS_FOUND, text),)
+        return of_images, _found(f"the names of the images: {named[1]}")
     return None, ()
+
+
+def _found(what: object) -> tuple[CaptureWarning, ...]:
+    text = f"The light directions were read from {what}. Give --lights FILE for others."
+    return (CaptureWarning(LIGHTS_FOUND, text),)
 
 
 def _places(folder: Path, of_images: Path) -> Iterator[list[Path]]:
     """Yield the files of each place that may be light files, the nearest first."""
-    yield [path for each in dict.fromkeys((folder, of_images)) for path in _likely(each)]
+    near = dict.fromkeys((folder, of_images))
+    yield [path for each in near for path in _likely(each)]
     above = folder.absolute().parent
     with suppress(InputError):  # we may lack permission to read the folder above
         for around in dict.fromkeys((folder, of_images, above)):
-            named = [e for e in list_folder(around) if _LIGHT_FOLDER.fullmatch(e.name.lower())]
-            folders = [each for each in named if is_folder(each) and not list_images(each)]
-            yield [path for each in folders for path in _candidates(each)]
+            yield [path for each in light_folders(around) for path in _candidates(each)]
         name, entries = folder_name(folder).lower(), list_folder(above)
         others = {each.name.lower() for each in entries if is_folder(each)} - {name}
         own = [path for path in _candidates(above) if path.stem.lower() == name]
         yield own or [path for path in _likely(above) if path.stem.lower() not in others]
+
+
+def light_folders(folder: Path) -> list[Path]:
+    """Return the subfolders that are called Lights or similarly, and contain no images."""
+    named = [each for each in list_folder(folder) if _LIGHT_FOLDER.fullmatch(each.name.lower())]
+    return [each for each in named if is_folder(each) and not list_images(each)]
+
+
+def has_lights(folder: Path) -> bool:
+    """Return whether a folder has files or folders with the names of lights."""
+    return bool(_likely(folder) or light_folders(folder))
 
 
 def _likely(folder: Path) -> list[Path]:
@@ -143,13 +156,19 @@ def _candidates(folder: Path) -> list[Path]:
 
 
 def _fit(
-    path: Path, images: Sequence[Path], form: RowForm = "xyz", *, by_order: bool = False
+    path: Path,
+    images: Sequence[Path],
+    form: RowForm = "xyz",
+    *,
+    by_order: bool = False,
+    named: bool = False,
 ) -> Float64Array | None:
     """Return the lights (F, 3) of a file in the order of the images, with NaN for images without
     one; None if it does not fit them.
 
     Args:
         by_order: whether it may name other images.
+        named: whether it must name images.
     """
     longest = min(numbers.MOST_TEXT, 20_000 + 500 * len(images))  # others take seconds to read
     with suppress(InputError, OSError):
@@ -159,7 +178,7 @@ def _fit(
             with suppress(InputError):
                 table, directions = read_lights(path, count, form=form)
                 if table.names is None:
-                    return directions
+                    return None if named else directions
                 chosen, how = match_images(table, images)
                 if how == "order" and not by_order:
                     return None

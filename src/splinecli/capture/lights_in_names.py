@@ -97,7 +97,7 @@ def _sides(images: Sequence[Path]) -> tuple[Rows, str]:
     """Read left, right, top, bottom and front, also two of them: the rest of the names is equal."""
     rows, rests = Rows(), set[str]()
     for image in images:
-        stem = image.stem.lower()
+        stem = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", image.stem).lower()
         if len(found := _SIDE.findall(stem)) != 1:
             continue
         words = re.findall("|".join(sorted(_SIDE_OF, key=len, reverse=True)), found[0])

@@ -22,7 +22,7 @@ from splinecli.capture.formats.mat import names, read_matrix
 from splinecli.capture.formats.numbers import NumberRow, read_lines, read_number_rows, to_number
 from splinecli.capture.light_files import FORMATS, format_of, read_light_positions
 from splinecli.capture.light_rows import LightFrame, read_light_rows, usable_intensities
-from splinecli.capture.light_search import find_light_file
+from splinecli.capture.light_search import find_light_file, light_folders
 from splinecli.capture.linearise import Window
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Floats, Integers
@@ -407,7 +407,9 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
     if positions is None and options.distance is None:
         positions, used = find_named(folder, LIGHT_POSITIONS), lights is None
         if positions is None and used and find_light_file(folder) is None:
-            positions = next(filter(is_near_ps, list_folder(folder)), None)
+            places = folder, *light_folders(folder)
+            entries = (path for place in places for path in list_folder(place))
+            positions = next(filter(is_near_ps, entries), None)
         if positions is None and lights is not None and lights.is_file():
             positions = find_named(lights.parent, LIGHT_POSITIONS)
         if positions is None:

@@ -310,7 +310,10 @@ def _read_all_lights(
             " R, G, B"
         )
         if error.n_found == CHANNELS:
-            hint = "Give each image under these three lamps a folder of its own"
+            hint = (
+                "Give each image under these three lamps a folder of its own, with the one without"
+                " contact if there is one"
+            )
         raise InputError(problem, path=error.path, hint=hint) from None
 
 
