@@ -144,6 +144,7 @@ def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...
 # The light file of PSBox (Y. Xiong), whose images are in the folder Objects
 _PSBOX_LIGHTS = ("light_directions.txt",)
 # Words in the names of pictures that other programs leave beside the photographs.
+_IMAGE_FOLDERS = ("images", "image", "imgs", "img", "photos", "photographs", "pictures", "objects")
 _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all", "depth"})
 
 
@@ -217,11 +218,15 @@ def _images_folder(folder: Path) -> Path | None:
 
 
 def _holder(folder: Path) -> Path:
-    """Return the folder around a folder of images that has no light file of its own."""
-    around = _parent(folder)
+    """Return the folder around a folder called `images` or similarly that has no light file of its
+    own.
+    """
+    around, name = _parent(folder), files.folder_name(folder)
+    if name.lower() not in _IMAGE_FOLDERS or has_lights(folder):
+        return folder
     with suppress(InputError):  # we may lack permission to read the one around
-        inside = None if has_lights(folder) else _images_folder(around)
-        if inside is not None and inside.name == files.folder_name(folder):
+        inside = _images_folder(around)
+        if inside is not None and inside.name == name:
             return around
     return folder
 

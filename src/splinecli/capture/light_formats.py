@@ -190,27 +190,35 @@ def _objects(values: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | 
     """
     if isinstance(values, dict) and all(isinstance(each, dict) for each in values.values()):
         values = [{"file": name, **each} for name, each in values.items()]
-    names, vectors = [], list[list[float]]()
-    for each in values if isinstance(values, list) else []:
-        if not isinstance(each, dict):
-            return None
-        found = _vectors([value for value in each.values() if _vectors([value])]) or []
-        found = [vector for vector in found if len(vector) == 3] or _vectors([each]) or []
-        lights = [
-            key for key in each if re.search("light|dir", key, re.I) and _vectors([each[key]])
-        ]
-        if len(found) != 1 and len(lights) == 1:
-            found = _vectors([each[lights[0]]]) or []
-        if not found and (angles := _vectors([each], ("azimuth", "elevation"))) is not None:
-            found = directions_from_angles(np.array(angles), "azel").tolist()
-        if len(found) != 1:
-            return None
-        vectors += found
-        words = (each.get(key) for key in each if re.match("file|im|name|path|photo", key, re.I))
-        names += [image_name(word, []) for word in words if isinstance(word, str)][:1]
-    if not vectors or len(names) not in (0, len(vectors)):
+    objects = values if isinstance(values, list) else []
+    lights = [_light_of(each) if isinstance(each, dict) else None for each in objects]
+    if not lights or None in lights:
         return None
-    return tuple(names) if names else None, vectors
+    names = []
+    for each in objects:
+        words = (each[key] for key in each if re.match("file|im|name|path|photo", key, re.I))
+        names += [image_name(word, []) for word in words if isinstance(word, str)][:1]
+    if len(names) not in (0, len(lights)):
+        return None
+    return tuple(names) if names else None, [light for light in lights if light is not None]
+
+
+def _light_of(values: dict[str, Any]) -> list[float] | None:
+    """Return the only vector of an object, or the only one called a light or direction; or x, y and
+    z, or azimuth and elevation; None for none.
+    """
+    found = {key: read[0] for key, value in values.items() if (read := _vectors([value]))}
+    vectors = {key: vector for key, vector in found.items() if len(vector) == 3}
+    for word in ("", "light", "dir"):
+        chosen = [vector for key, vector in vectors.items() if re.search(word, key, re.I)]
+        if len(chosen) == 1:
+            return chosen[0]
+    angles = _vectors([values], ("azimuth", "elevation"))
+    if angles is not None:
+        ((x, y, z),) = directions_from_angles(np.array(angles), "azel").tolist()
+        return [x, y, z]
+    own = _vectors([values])
+    return None if own is None or vectors else own[0]
 
 
 def _vectors(values: Any, keys: Sequence[str] = "xyz") -> list[list[float]] | None:

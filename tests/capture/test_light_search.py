@@ -1,0 +1,283 @@
+"""Lights where people keep them: in other folders, in .mat and JSON files, and in names of images.
+
+The oracle is a matte sphere: wherever its lights are, the normals are those of its geometry.
+"""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+import scenes
+from scenes import codes, put, to_uint16, write_image
+from splinecli.capture import CaptureOptions, find_captures, open_capture
+from splinecli.capture.lights_in_names import lights_in_names
+from splinecli.errors import InputError
+from splinecli.estimate.inference import estimate_normals
+from splinecli.estimate.methods import make_estimator
+from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.recipe import RecipeOptions, prepare_capture
+
+NORMALS, DISC = scenes.sphere(32, 0.6)
+LIGHTS = scenes.spiral_lights(8, 40)
+LINES = "\n".join(" ".join(map(str, row)) for row in LIGHTS.tolist())
+NAMED = [(f"{number:03}.png", row) for number, row in enumerate(LIGHTS.tolist())]
+LP = "8\n" + "\n".join(f"{name} {x} {y} {z}" for name, (x, y, z) in NAMED)
+
+
+def pictures(lights=LIGHTS):
+    return to_uint16(np.moveaxis(scenes.shade(NORMALS, lights), -1, 0) * 50_000)
+
+
+def check(folder, **options):
+    """Compare the normals with the geometry, and return the source and its warnings."""
+    source = open_capture(folder, CaptureOptions(**options))
+    capture = prepare_capture(source, options=RecipeOptions(as_stored=True))
+    normals = estimate_normals(capture, make_estimator("ls")).normal_map
+    # 16-bit values as stored, without shadows: least squares is exact to a few thousandths of a
+    # degree.
+    inside = capture.mask & DISC
+    assert angle_between_deg(normals[inside], NORMALS[inside]).max() < 0.1
+    return source, codes(source)
+
+
+PLACES = {
+    "Lights/lights.csv": LINES.replace(" ", ","),
+    "lighting/anything.txt": LINES,
+    "../Lights/lights.txt": LINES,
+    "../lights.txt": LINES,
+    "../owl.lp": LP,
+    "light_dir.txt": LINES,
+    "data.json": json.dumps([{"file": name, "light_dir": row} for name, row in NAMED]),
+}
+
+
+@pytest.mark.parametrize("of_images", ["", "images"])
+@pytest.mark.parametrize("name", PLACES)
+def test_light_files_in_other_places(tmp_path, name, of_images):
+    folder = tmp_path / "all/owl"
+    scenes.write_capture(folder / of_images, pictures(), None)
+    put(folder / name, PLACES[name])
+    put(tmp_path / "all/cat.lp", LP.replace("0.0", "0.9"))
+    (tmp_path / "all/cat").mkdir()  # which owns the other file
+    source, found = check(folder)
+    assert found == ["lights_found"] and source.files.name == "owl"
+    assert str((folder / name).resolve()) in str(source.warnings[0])
+    assert find_captures(folder) == [folder]
+
+
+def test_lights_among_the_images_of_a_folder_inside(tmp_path):
+    scenes.write_capture(tmp_path / "images", pictures(), LIGHTS)
+    assert check(tmp_path)[1] == ["lights_found"]
+
+
+def test_a_folder_of_images_beside_the_lights(tmp_path):
+    scenes.write_capture(tmp_path / "owl/Images", pictures(), None, mask=DISC)
+    put(tmp_path / "owl/Lights/lights.txt", LINES)
+    for folder in (tmp_path / "owl", tmp_path / "owl/Images"):
+        source, found = check(folder)
+        assert (found, source.name) == (["lights_found"], "owl")
+        assert (source.read_mask(DISC.shape) == DISC).all()
+
+
+def test_files_that_do_not_fit_or_differ(tmp_path):
+    folder = scenes.write_capture(tmp_path / "all/owl", pictures(), None)
+    put(tmp_path / "all/lights.txt", LINES + "\n0 0 1")
+    with pytest.raises(InputError, match=r"found 8 images \(000.png, .* Pass --lights FILE"):
+        open_capture(folder)
+    put(folder / "Lights/a.txt", LINES)
+    put(folder / "Lights/b.txt", LINES)
+    assert check(folder)[1] == ["lights_found"]
+    put(folder / "Lights/b.txt", "\n".join(LINES.splitlines()[::-1]))
+    with pytest.raises(InputError, match=r"2 files that may be its lights: a\.txt, b\.txt"):
+        open_capture(folder)
+
+
+def xyz(row):
+    return dict(zip("xyz", row, strict=True))
+
+
+OBJECTS = {
+    "file and light_dir": [{"file": name, "light_dir": row} for name, row in NAMED],
+    "in a list of images": {
+        "version": 1,
+        "images": [{"filename": name, "light": xyz(row)} for name, row in NAMED],
+    },
+    "with positions, too": [
+        {"image": f"C:\\rti\\{name}", "light_dir": row, "light_position": [1, 2, 3]}
+        for name, row in NAMED
+    ],
+    "by name": {name: {"direction": row, "exposure": 0.1} for name, row in NAMED},
+    "x, y and z": {"lights": [{"path": name, **xyz(row)} for name, row in NAMED]},
+    "angles": [
+        {
+            "name": name,
+            "azimuth": np.degrees(np.arctan2(y, x)),
+            "elevation": np.degrees(np.arcsin(z)),
+        }
+        for name, (x, y, z) in NAMED
+    ],
+}
+
+
+@pytest.mark.parametrize("case", OBJECTS)
+def test_json_objects(tmp_path, case):
+    folder = scenes.write_capture(tmp_path, pictures(), None)
+    put(folder / "lights.json", json.dumps(OBJECTS[case]))
+    assert check(folder)[1] == []
+    for damaged in ([{"file": 1}], [{"file": "a"}, 3], [{"light_dir": [1]}], {"a": {"b": {}}}):
+        put(folder / "lights.json", json.dumps(damaged))
+        with pytest.raises(InputError, match='found no list "lights"'):
+            open_capture(folder)
+
+
+IMAGES = np.moveaxis(pictures(), 0, -1)
+MAT = {
+    "I, L, mask": {"I": IMAGES, "L": LIGHTS, "mask": DISC.astype(np.uint8)},
+    "I, S, M": {"I": IMAGES / 65535, "S": LIGHTS.T, "M": DISC.astype(float)},
+    "colour": {"images": np.repeat(IMAGES[:, :, None], 3, axis=2), "lights": LIGHTS, "mask": DISC},
+    "as NumPy has it": {"imgs": pictures(), "light_directions": LIGHTS, "mask": DISC},
+    "with normals": {"I": IMAGES, "S": LIGHTS, "N": NORMALS, "mask": DISC},
+    "numbered": {
+        "mask": DISC,
+        **{f"im{number}": picture for number, picture in enumerate(pictures())},
+        **{f"l{number}": light[None] for number, light in enumerate(LIGHTS)},
+    },
+}
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("case", MAT)
+def test_mat_files(tmp_path, case, compressed):
+    savemat(tmp_path / "owl.mat", MAT[case], do_compression=compressed)
+    source, found = check(tmp_path)
+    assert found == [] and source.n_lights == 8 and source.files.images[2].name == "owl.mat[2]"
+    assert (source.read_mask(DISC.shape) == DISC).all()
+    stamp = source.stamp
+    savemat(tmp_path / "owl.mat", {**MAT[case], "x": 1})
+    assert open_capture(tmp_path).stamp != stamp
+
+
+def test_mat_files_that_are_not_read(tmp_path):
+    put(tmp_path / "a.mat", "MATLAB 7.3 MAT-file" + 300 * " ")
+    with pytest.raises(InputError, match=r"a\.mat: found a MATLAB 7\.3 file, .* -v7\."):
+        open_capture(tmp_path)
+    savemat(tmp_path / "a.mat", {"I": np.zeros((4, 5), object)})
+    with pytest.raises(InputError, match=r"no images, but 1 \.mat file\. .* numeric array H x W x"):
+        open_capture(tmp_path)
+    for name in "ab":
+        savemat(tmp_path / f"{name}.mat", MAT["I, L, mask"])
+    with pytest.raises(InputError, match=r"2 \.mat files with photographs \(a\.mat, b\.mat\)"):
+        open_capture(tmp_path)
+
+
+def yale(azimuth, elevation):
+    azimuth, elevation = np.radians((azimuth, elevation))
+    level = np.cos(elevation)
+    return -level * np.sin(azimuth), np.sin(elevation), level * np.cos(azimuth)
+
+
+AT_45 = {"left": (-1, 0, 1), "right": (1, 0, 1), "top": (0, 1, 1), "bottom": (0, -1, 1)}
+IN_NAMES = {
+    "Yale": {f"B01_P00A{a:+04}E{e:+03}": yale(a, e) for a in (-35, 0, 35) for e in (-20, 0, 40)},
+    "x and y": {f"a_{x}_{y}": (x, y, 1) for x in (-0.7, 0.0, 0.5) for y in (-0.5, 0.0, 0.75)},
+    "unit vectors": {
+        f"x{x}_y{y}": (x, y, np.sqrt(1 - x * x - y * y)) for x in (-0.5, 0.3) for y in (-0.2, 0.4)
+    },
+    "vectors": {f"owl {x:.6f},{y:.6f},{z:.6f}": (x, y, z) for x, y, z in LIGHTS.tolist()},
+    "angles": {
+        f"az{azimuth}_el50": scenes.directions_at(np.radians([azimuth]), np.radians(40))[0]
+        for azimuth in range(0, 360, 45)
+    },
+    "sides": {f"{n}_brick_{side}": light for n, (side, light) in enumerate(AT_45.items())},
+    "corners": {
+        **{f"Light{side.title()}": light for side, light in AT_45.items()},
+        "LightTopLeft": (-1, 1, np.sqrt(2)),
+        "LightFront": (0, 0, 1),
+    },
+}
+
+
+@pytest.mark.parametrize("case", IN_NAMES)
+def test_lights_in_names(tmp_path, case):
+    lights = unit(np.array([*IN_NAMES[case].values()], np.float64))
+    for name, picture in zip(IN_NAMES[case], pictures(lights), strict=True):
+        write_image(tmp_path / f"{name}.png", picture)
+    write_image(tmp_path / "owl_mask.pgm", DISC.astype(np.uint8) * 255)
+    source, found = check(tmp_path)
+    assert found == ["lights_found", "mask_choice"]
+    assert "were read from the names of the images: " in str(source.warnings[0])
+    put(tmp_path / "lights.lp", "\n".join(f"{name} 0 0 1" for name in IN_NAMES[case]))
+    assert (open_capture(tmp_path).light_directions == (0, 0, 1)).all()  # a file takes precedence
+
+
+@pytest.mark.parametrize(
+    "names", ["a_1_2 a_3_4 a_5_6", "left right top owl cat", "left_a right_b top_c", "a-1_1 a-1_2"]
+)
+def test_names_without_lights(tmp_path, names):
+    assert lights_in_names([tmp_path / f"{name}.png" for name in names.split()]) is None
+
+
+def test_lights_behind_the_image_plane_are_left_out(tmp_path):
+    """Fifteen of the 64 lights of Yale B are at 90 degrees or more from the camera axis."""
+    angles = [(azimuth, 20) for azimuth in (-130, -110, -90, -60, -30, 0, 30, 60, 90, 110, 130)]
+    for azimuth, elevation in (*angles, (0, 40)):
+        light = np.array(yale(azimuth, elevation))
+        write_image(tmp_path / f"A{azimuth:+04}E{elevation:+03}.png", pictures(light[None])[0])
+    write_image(tmp_path / "P00_Ambient.png", np.zeros((32, 32), np.uint16))
+    source = open_capture(tmp_path)
+    assert codes(source) == ["images_left_out", "lights_found", "ambient_subtracted"]
+    assert "...: 6 of 12 images were left out, because their lights" in str(source.warnings[0])
+    assert source.files.ambient == tmp_path / "P00_Ambient.png" and source.n_lights == 6
+
+
+def test_near_ps(tmp_path):
+    """Lamps of near_ps are the same as those in light_positions.txt and light_lobes.txt."""
+    folder = scenes.write_bump(tmp_path / "bump")
+    (width, focal, distance), (u, v) = (2.0, 600.0, 1200.0), (15.0, 17.0)
+    matrix = np.array([[focal, 0, u], [0, focal, v], [0, 0, 1]])
+    np.savetxt(folder / "light_positions.txt", scenes.BUMP_LAMPS)
+    axes = unit(-scenes.BUMP_LAMPS)
+    np.savetxt(folder / "light_lobes.txt", np.column_stack((axes, np.full(len(axes), 1.5))))
+    np.savetxt(folder / "camera_matrix.txt", matrix)
+    put(folder / "pixel_size.txt", str(width))
+    np.savetxt(folder / "light_intensities.txt", np.linspace(1, 2, len(axes)))
+    expected = prepare_capture(open_capture(folder)).lamps
+    for path in folder.glob("*.txt"):
+        path.unlink()
+    # The rule of docs/light-files.md, the other way round
+    middle = distance * (np.array((15.5, 15.5)) - (u, v)) / focal
+    x, y, z = scenes.BUMP_LAMPS.T
+    positions = np.stack((x + middle[0], middle[1] - y, distance - z), axis=1)
+    squares = np.square(scenes.BUMP_LAMPS).sum(axis=1, keepdims=True)
+    lamps = {
+        "S": positions,
+        "Dir": axes * (1, -1, -1),
+        "mu": np.full((len(axes), 1), 1.5),
+        "Phi": np.linspace(1, 2, len(axes))[:, None] * squares,  # on the axes
+    }
+    savemat(folder / "light.mat", lamps)
+    savemat(folder / "camera.mat", {"K": matrix})
+    with pytest.raises(InputError, match=r"light\.mat: the scale .* Give --pixel-size: the"):
+        open_capture(folder)
+    put(folder / "pixel_size.txt", str(width))
+    source = open_capture(folder)
+    np.testing.assert_allclose(source.light_intensities[:, 0], np.linspace(1, 2, len(axes)))
+    found = prepare_capture(source).lamps
+    assert expected is not None and found is not None
+    for name in ("positions", "lobes", "reference_distances", "camera_matrix"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-9)
+    (folder / "camera.mat").unlink()
+    with pytest.raises(InputError, match=r"relative to the camera, .* Give --camera-matrix and"):
+        open_capture(folder)
+
+
+def test_opencv_reads_what_cv2_writes(tmp_path):
+    """A matrix in XML, with a name that only its place makes one of lights."""
+    folder = scenes.write_capture(tmp_path, pictures(), None)
+    file = cv2.FileStorage(str(folder / "lights.xml"), cv2.FILE_STORAGE_WRITE)
+    file.write("L", LIGHTS)
+    file.release()
+    assert check(folder)[1] == ["lights_found"]

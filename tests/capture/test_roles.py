@@ -1,0 +1,149 @@
+"""Pictures that are not photographs: masks in every format, ambient images, and sensors without
+contact.
+"""
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+import scenes
+from scenes import codes, put, to_uint16, write_image
+from splinecli.capture import CaptureOptions, find_capture_files, open_capture
+from splinecli.capture.files import Overrides
+from splinecli.errors import InputError
+from splinecli.estimate.inference import estimate_normals
+from splinecli.estimate.methods import make_estimator
+from splinecli.lights.calibration.balls import find_ball_files
+from splinecli.maths.normals import angle_between_deg
+from splinecli.recipe import RecipeOptions, prepare_capture
+
+NORMALS, DISC = scenes.sphere(24, 0.8)
+LIGHTS = scenes.spiral_lights(6, 40)
+PICTURES = to_uint16(np.moveaxis(scenes.shade(NORMALS, LIGHTS), -1, 0) * 50_000)
+MASK = DISC.astype(np.uint8) * 255
+
+
+def write(path, picture):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".webp":
+        Image.fromarray(np.dstack([picture] * 3).astype(np.uint8)).save(path, lossless=True)
+    else:
+        write_image(path, np.dstack([picture] * 3) if path.suffix == ".ppm" else picture)
+
+
+@pytest.mark.parametrize("photographs", [".png", ".pgm", ".webp", ".jpg", "stack"])
+@pytest.mark.parametrize(
+    "mask",
+    ["mask.pgm", "mask.webp", "owl_mask.png", "face_mask.pgm", "owlMask.webp", "stack_mask.tif"],
+)
+def test_masks_in_every_format(tmp_path, photographs, mask):
+    if photographs == "stack":
+        tifffile.imwrite(tmp_path / "stack.tif", PICTURES, photometric="minisblack")
+    else:
+        for number, picture in enumerate(PICTURES):
+            write(tmp_path / f"{number}{photographs}", (picture >> 8).astype(np.uint8))
+    write(tmp_path / mask, MASK)
+    np.savetxt(tmp_path / "lights.txt", LIGHTS)
+    for options in (CaptureOptions(), CaptureOptions(needs_lights=False)):
+        source = open_capture(tmp_path, options)
+        assert source.n_lights == 6 and (source.read_mask(DISC.shape) == DISC).all()
+        assert ("mask_choice" in codes(source)) != (mask in ("mask.pgm", "mask.webp"))
+    balls = find_ball_files(tmp_path)
+    assert len(balls.images) == 6 and balls.mask == source.files.mask
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Return a capture without a mask."""
+    return scenes.write_capture(tmp_path / "owl", PICTURES, LIGHTS)
+
+
+def test_two_masks_are_named_by_all(folder):
+    for name in ("a_mask.pgm", "b.mask.png"):
+        write(folder / name, MASK)
+    text = "a_mask.pgm, b.mask.png: none is used as the mask. Choose one with --mask FILE."
+    source = open_capture(folder)
+    assert codes(source) == ["mask_choice"] and str(source.warnings[0]) == text
+    assert source.n_lights == 6
+    assert [str(warning) for warning in find_ball_files(folder).warnings] == [text]
+    with pytest.raises(InputError, match=text):
+        open_capture(folder, CaptureOptions(needs_lights=False))
+    mask = folder / "b.mask.png"
+    assert open_capture(folder, CaptureOptions(needs_lights=False, mask=mask)).n_lights == 6
+
+
+def test_an_object_that_is_called_mask(tmp_path):
+    folder = scenes.write_capture(tmp_path, PICTURES, LIGHTS, names="mask_{}.png")
+    assert open_capture(folder).n_lights == 6 and codes(open_capture(folder)) == []
+
+
+def test_a_preview_among_rare_formats_is_no_photograph(folder):
+    for number, path in enumerate(sorted(folder.glob("*.png"))):
+        write(folder / f"{number}.pgm", PICTURES[number])
+        path.unlink()
+    write(folder / "preview.png", MASK)
+    assert len(find_capture_files(folder, Overrides()).images) == 6
+
+
+def test_ambient_by_name(folder):
+    write(folder / "owl_Ambient.png", np.full((24, 24), 500, np.uint16))
+    source = open_capture(folder)
+    assert codes(source) == ["ambient_subtracted"]
+    assert source.files.ambient == folder / "owl_Ambient.png" and source.n_lights == 6
+    write(folder / "ambient_2.png", np.full((24, 24), 900, np.uint16))
+    source = open_capture(folder)  # it is unclear which
+    assert codes(source) == ["images_left_out"] and source.files.ambient is None
+
+
+GEL_LIGHTS = np.array([(0, 0.8, 0.6), (-0.6, -0.4, 0.69), (0.6, -0.5, 0.62)])
+
+
+def write_gel(folder, names):
+    """Write a flat gel, unevenly lit by unequal coloured lamps, and the same with a ball in it."""
+    y, x = np.indices((48, 64))
+    inside = np.hypot(x - 30, y - 22) < 10
+    nx, ny = (x - 30) / 20 * inside, (22 - y) / 20 * inside
+    normals = np.stack((nx, ny, np.sqrt(1 - nx**2 - ny**2)), axis=-1)
+    uneven = (0.6 - 0.2 * ((x - 32) / 32) ** 2)[..., None] * (1.0, 0.8, 0.6)
+    flat = np.broadcast_to((0.0, 0, 1), normals.shape)
+    for name, surface in zip(names, (flat, normals), strict=True):
+        shading = (surface @ GEL_LIGHTS.T).clip(0) * uneven
+        write_image(folder / name, to_uint16(shading[..., ::-1] * 65_535))
+    np.savetxt(folder / "light_directions.txt", GEL_LIGHTS)
+    return normals
+
+
+@pytest.mark.parametrize("reference", ["ref", "Background", "gel_empty", "no-contact", "000"])
+def test_a_gel_without_contact_is_the_flat_field(tmp_path, reference):
+    normals = write_gel(tmp_path, (f"{reference}.png", "press.png"))
+    options = CaptureOptions(lights_in_channels=True)
+    source = open_capture(tmp_path, options)
+    assert codes(source) == ["flat_field_choice", "lights_in_channels"]
+    capture = prepare_capture(source, options=RecipeOptions(as_stored=True))
+    found = estimate_normals(capture, make_estimator("ls")).normal_map
+    # Divided by the picture without contact, uneven and unequal lamps leave no trace.
+    assert angle_between_deg(found, normals).max() < 0.1
+    (tmp_path / "flats").mkdir()
+    (tmp_path / f"{reference}.png").rename(tmp_path / "flats/1.png")
+    assert open_capture(tmp_path, options).n_lights == 3
+
+
+def test_a_gel_of_which_no_picture_is_clearly_without_contact(tmp_path):
+    write_gel(tmp_path, ("other.png", "1.png"))
+    write_gel(tmp_path, ("other.png", "2.png"))
+    (tmp_path / "other.png").unlink()
+    with pytest.raises(InputError, match=r"found 2 images .* but lights for 1 in .* --flat-field"):
+        open_capture(tmp_path, CaptureOptions(lights_in_channels=True))
+    with pytest.raises(InputError, match=r"shine at once, add --lights-in-channels"):
+        open_capture(tmp_path)
+    write_gel(tmp_path, ("ref.png", "3.png"))
+    with pytest.raises(InputError, match=r"expected 12, three .* a folder of its own"):
+        open_capture(tmp_path, CaptureOptions(lights_in_channels=True))
+
+
+def test_too_few_photographs(tmp_path):
+    write(tmp_path / "1.png", PICTURES[0])
+    put(tmp_path / "output.txt", "1 2 3")
+    with pytest.raises(InputError, match=r"found 1 image \(1\.png\) .* at least three photographs"):
+        open_capture(tmp_path)
