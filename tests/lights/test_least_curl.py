@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scenes import cap_directions, sphere
-from splinecli.estimate.light_search import search_lights
+from splinecli.estimate.light_descent import best_lights
 from splinecli.lights.least_curl import (
     Lights,
     curl_terms,
@@ -85,6 +85,6 @@ def test_the_network_expects_smaller_errors_under_lights_nearer_to_the_true_ones
     far = unit(true * (1, 1, 3))
     starts = [Lights(far, np.ones(10)), Lights(start, np.ones(10))]
     errors = np.full(10, 9.0)
-    found = search_lights(images, mask, starts, start, errors, errors, intensities_known=True)
+    found = best_lights(images, mask, starts, start, errors, errors, intensities_known=True)
     assert found.start == 1
     assert differ_by_deg(found.lights.directions, true) < 0.75 * differ_by_deg(start, true)

@@ -11,7 +11,7 @@ from scenes import Floats, cap_directions, ring_lights, shade, sphere, sphere_ca
 from splinecli import estimate_normals
 from splinecli.errors import InputError, UsageError
 from splinecli.estimate.confidence import add_common_error
-from splinecli.estimate.light_search import search_lights
+from splinecli.estimate.light_descent import best_lights
 from splinecli.lights import unknown_lights
 from splinecli.lights.outline import outline_share, turn_at_outline
 from splinecli.lights.unknown_lights import bump_log_odds, lower_lights
@@ -37,9 +37,7 @@ def images_of(observations: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def find_lights(observations, mask, intensities_known, **options):
-    return unknown_lights.find_lights(
-        observations, mask, intensities_known, search_lights, **options
-    )
+    return unknown_lights.find_lights(observations, mask, intensities_known, best_lights, **options)
 
 
 def mean_angle(found: Floats, true: Floats) -> float:
@@ -154,10 +152,7 @@ def test_without_outline_the_first_light_decides_between_bump_and_hollow(hollow)
     images = shade(normals, true, noise=0.002).astype(np.float32)
     with pytest.raises(
         InputError,
-        match=(
-            r"a bump or a hollow.* add --auto-mask, or give its mask\. .* --first-light "
-            r"left"
-        ),
+        match=r"a bump or a hollow.* give its mask with --mask .* the first image .* left",
     ):
         find_lights(images, everywhere, True)
     found = find_lights(images, everywhere, True, first_light="left")

@@ -332,7 +332,7 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
                 " photograph under three coloured lamps is read with --lights-in-channels"
             )
             hint, option = f"{hint} {option or '--lights FILE'}", None
-        raise NoLightsError(
+        raise (InputError if option else NoLightsError)(
             f"found {found} but no light file",
             folder,
             hint=f"Add {option}"

@@ -85,6 +85,11 @@ class Source:
         raise NotImplementedError
 
     @property
+    def has_lights(self) -> bool:
+        """Whether the light directions are given."""
+        return True
+
+    @property
     def has_mask(self) -> bool:
         """Whether the mask is given, so that none is found in the images."""
         return True
@@ -206,6 +211,10 @@ class CaptureSource(Source):
     @property
     def name(self) -> str:
         return self.files.name
+
+    @property
+    def has_lights(self) -> bool:
+        return self.files.light_directions is not None
 
     @property
     def has_mask(self) -> bool:

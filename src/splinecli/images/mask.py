@@ -7,6 +7,8 @@ import numpy as np
 from splinecli.errors import InputError
 from splinecli.maths import Bools, Float32Array
 
+_DARK = 0.2  # brightness of a dark background, as a share of the object's
+
 
 def surrounds_hole(mask: Bools) -> bool:
     """Return whether a mask (H, W) has the border of the picture, and leaves out a part of its
@@ -25,7 +27,7 @@ def looks_inverted(mask: Bools, brightness: Float32Array) -> bool:
     )
 
 
-def find_object(brightness: Float32Array) -> Bools:
+def find_object(brightness: Float32Array, *, is_requested: bool = True) -> Bools:
     """Return the mask (H, W) of an object before a darker background.
 
     Otsu's threshold ("A threshold selection method from gray-level histograms", 1979) is taken of
@@ -33,7 +35,8 @@ def find_object(brightness: Float32Array) -> Bools:
     bright parts than to the background. The mask is the largest connected area above it, with its
     holes filled. This fails if the background is as bright as the object. The brightness (H, W) is
     linear: the mean over all lights. Raises InputError if nearly nothing is brighter than the
-    background, or nearly everything is.
+    background, or nearly everything is; for a mask that was not requested, also if the background
+    is not dark, because the darker part of an object that fills the image looks like one.
     """
     import cv2
 
@@ -58,4 +61,7 @@ def find_object(brightness: Float32Array) -> Bools:
         raise InputError(
             problem, hint="Paint a mask, white on the object, and pass it with --mask FILE"
         )
+    ratio = float(np.median(smooth[~mask]) / max(np.median(smooth[mask]), 1e-12))
+    if not is_requested and ratio > _DARK:
+        raise InputError(f"no mask was found: the background is not dark ({100 * ratio:.0f} %)")
     return np.asarray(mask)

@@ -85,7 +85,7 @@ class Lights(NamedTuple):
     intensities: Float64Array
 
 
-class SearchedLights(NamedTuple):
+class BestLights(NamedTuple):
     """The lights that a search chose, and the evidence for them."""
 
     lights: Lights

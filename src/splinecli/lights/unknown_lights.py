@@ -14,7 +14,7 @@ Three witnesses find the lights. The light network guesses each light from shadi
 outline, and predicts the error of its guess. A matte surface under F lights has images of rank 3
 (Hayakawa, JOSA A 1994), and its normals have no curl: see least_curl.py. Lights near the guess and
 lights of least curl then start a search for those under which the network that estimates normals
-expects the smallest errors: see estimate/light_search.py. Cast shadows and the outline decide
+expects the smallest errors: see estimate/light_descent.py. Cast shadows and the outline decide
 between bump and hollow.
 """
 
@@ -28,8 +28,8 @@ from splinecli.capture.record import FoundLights, azimuth_of
 from splinecli.errors import InputError
 from splinecli.lights.least_curl import (
     OPPOSITE,
+    BestLights,
     Lights,
-    SearchedLights,
     differ_by_deg,
     lights_of_least_curl,
 )
@@ -146,8 +146,8 @@ _MOST_STARTS = 3
 # largest probability that bump and hollow were confused; captures with a larger one are refused
 _MOST_OPPOSITE = 0.25
 
-Search = Callable[..., SearchedLights]
-"""See search_lights in estimate/light_search.py, which uses the network that estimates normals."""
+Search = Callable[..., BestLights]
+"""See best_lights in estimate/light_descent.py, which uses the network that estimates normals."""
 
 
 def find_lights(
@@ -157,6 +157,7 @@ def find_lights(
     search: Search,
     *,
     first_light: str | None = None,
+    first_image: str = "the first image",
     refuse: bool = True,
 ) -> FoundLights:
     """Find the lights of the images of one object.
@@ -164,8 +165,9 @@ def find_lights(
     The observations (P, F) are linear, 0 or more, and divided by the light intensities if they are
     known; else these are found, too. The mask (H, W) has P true pixels, in row-major order.
     `first_light` is where the light of the first observations comes from, see azimuth_of; it
-    decides between a bump and a hollow. Without it, shadows and the outline decide. If the images
-    do not determine the lights, an error is raised, or without `refuse` a guess is returned.
+    decides between a bump and a hollow. Without it, shadows and the outline decide. Messages call
+    the first image `first_image`. If the images do not determine the lights, an error is raised, or
+    without `refuse` a guess is returned.
 
     Raises UsageError if the first light is neither a known side nor an azimuth; InputError if the
     images are all alike, do not show one surface, or do not determine the lights.
@@ -214,7 +216,7 @@ def find_lights(
     opposite_deg = 2 * np.degrees(np.arccos(directions[:, 2].clip(-1, 1)))
     errors_deg = (1 - opposite_share) * errors_deg + opposite_share * opposite_deg
     if refuse and opposite_share > _MOST_OPPOSITE:
-        raise _open_question(mask)
+        raise _open_question(mask, first_image)
     if refuse and (expected := float(errors_deg.mean())) > LARGEST_ERROR_DEG:
         raise InputError(
             f"the images do not determine the lights: their estimated error is {expected:.0f}"
@@ -302,13 +304,12 @@ def _bump_or_hollow(
     return directions, 1 / (1 + math.exp(min(abs(log_odds), 500.0)))
 
 
-def _open_question(mask: Bools) -> InputError:
+def _open_question(mask: Bools, first_image: str) -> InputError:
     problem = "the images do not show whether the object is a bump or a hollow"
-    remedy = "add --auto-mask, or give its mask" if mask.all() else "give a mask of all of it"
-    whole = "" if is_outlined(mask) else f"If the images show the whole object, {remedy}. Else say"
+    whole = "If the images show the whole object, give its mask with --mask FILE. Else say"
     return InputError(
         f"{problem}, which looks alike under opposite lights",
-        hint=f"{whole or 'Say'} where the light of the first image that is used comes from:"
+        hint=f"{'Say' if is_outlined(mask) else whole} where the light of {first_image} comes from:"
         " --first-light left, upper-left, or its azimuth in degrees, counter-clockwise from the"
         " right",
     )

@@ -36,15 +36,17 @@ def unpacked(
     """Return the capture or, for a film, the folder in `output` with its frames.
 
     The frames are extracted if needed. `redo` decides whether the frames of an earlier film are
-    kept, replaced if the film differs, or extracted again. Raises UsageError without --lights
-    estimate, InputError if the film cannot be read, or its light does not move, or OutputError if
-    the folder contains frames from another film, or other files, or the frames cannot be written.
+    kept, replaced if the film differs, or extracted again. Raises UsageError if options are about a
+    light file, InputError if the film cannot be read, or its light does not move, or OutputError if
+    the folder contains frames from another film, or other files, or the frames cannot be
+    written.
     """
     if not is_film(capture):
         return capture
-    if not reading.finds_lights:
+    if not (reading.finds_lights or reading.may_find_lights):
         raise UsageError(
-            f"{capture} is a film, whose lights have to be found", hint="Add --lights estimate"
+            f"{capture} is a film, whose lights have to be found",
+            hint="Leave out options about lights that are given",
         )
     folder, stamp = output / FOLDER / capture.stem, digest([stamp_content(capture)])
     refuse_link(folder.parent)

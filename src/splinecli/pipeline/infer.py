@@ -302,10 +302,12 @@ def infer_capture(
     name = capture_name(folder)
     with held_results(name, options, observer) as target, observer.progress(name, 1.0) as show:
         clock = Clock(show)
-        if options.finds_lights:
-            _check_light_files(target)
         load = load or cache(partial(make_method, options))
-        work = _prepare(folder, options, clock)
+        source = options.open(folder)
+        if not source.has_lights:
+            _check_light_files(target)
+            load()  # sets the number of threads of PyTorch, which estimates the lights
+        work = _prepare(source, options, clock)
         _check_results(work.made, folder, options)
         estimate, distilled, work = estimate_capture(work, load, distil=options.distil, clock=clock)
         source, capture = work.files, work.made
@@ -379,16 +381,14 @@ def make_method(options: InferOptions) -> Estimator:
 def loads_first(options: InferOptions) -> bool:
     """Return whether the method has to be loaded before a capture is read.
 
-    Its options may be wrong, except for the precision, or the light directions are found in
-    PyTorch, whose number of threads loading sets.
+    Its options may be wrong, except for the precision.
     """
     chosen = replace(options.method_options, precision="auto") != MethodOptions()
-    return chosen or options.method != DEFAULT_METHOD or options.finds_lights
+    return chosen or options.method != DEFAULT_METHOD
 
 
-def _prepare(folder: Path, options: InferOptions, clock: Clock) -> Work:
-    """Return the capture of a folder, prepared but not judged."""
-    source = options.open(folder)
+def _prepare(source: CaptureSource, options: InferOptions, clock: Clock) -> Work:
+    """Return the capture of a source, prepared but not judged."""
     indices = source.places_of(options.light_indices)
     if options.n_lights is not None:
         directions = source.light_directions

@@ -22,6 +22,7 @@ from splinecli.capture.files import check_not_empty, list_images
 from splinecli.capture.formats.numbers import to_number
 from splinecli.capture.light_files import light_suffixes
 from splinecli.capture.light_rows import EXCHANGED, LightForm, parse_light_frame
+from splinecli.capture.light_search import NoLightsError
 from splinecli.capture.linearise import parse_window
 from splinecli.capture.near_lamps import LampOptions
 from splinecli.capture.reader import EQUAL
@@ -29,6 +30,7 @@ from splinecli.capture.record import ESTIMATE, SIDES_DEG, azimuth_of, check_ligh
 from splinecli.errors import UsageError
 from splinecli.estimate.methods import DEFAULT_METHOD, MethodOptions, check_method, method_names
 from splinecli.images.alignment import MIN_IMAGES
+from splinecli.lights.light_fit import FEWEST_TO_REFINE
 from splinecli.maths.normals import Convention
 from splinecli.maths.robust import MIN_LIGHTS
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
@@ -327,7 +329,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
                 hint="Leave one out, or use --crop for a first look",
             )
         if self.first_light is not None:
-            if not self.finds_lights:
+            if not (self.finds_lights or self.may_find_lights):
                 raise UsageError("--first-light needs --lights estimate", hint=add_it)
             azimuth_of(self.first_light)
         _ = self.lamps, parse_window(self.crop, self.scale), parse_transfer(self.transfer)
@@ -391,8 +393,42 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
             keeps_lights=self.light_frame is not None,
         )
 
+    @property
+    def may_find_lights(self) -> bool:
+        """Whether the lights are estimated if the capture has none: no option is about lights that
+        are given, or strict.
+        """
+        about_lights = (
+            self.lights,
+            self.light_frame,
+            self.light_positions,
+            self.light_distance,
+            self.strict or None,
+            self.lights_in_channels or None,
+        )
+        return self.light_format == "xyz" and all(each is None for each in about_lights)
+
     def open(self, folder: Path) -> CaptureSource:
-        """Open the capture in the folder with these options. Raises InputError."""
+        """Open the capture in the folder with these options; its lights remain to be estimated if
+        it has none. Raises InputError, or UsageError for a first light of lights that are given.
+        """
+        try:
+            source = self._open(folder, needs_lights=not self.finds_lights)
+        except NoLightsError:
+            if not self.may_find_lights:
+                raise
+            source = self._open(folder, needs_lights=False)
+            if source.n_lights < FEWEST_TO_REFINE:
+                raise
+        if source.has_lights and self.first_light is not None:
+            raise UsageError(
+                f"--first-light is about lights that are estimated, and {source.name} has a light"
+                " file",
+                hint="Add --lights estimate, or leave it out",
+            )
+        return source
+
+    def _open(self, folder: Path, *, needs_lights: bool) -> CaptureSource:
         return open_capture(
             folder,
             CaptureOptions(
@@ -406,7 +442,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
                 light_format=self.light_format,
                 lamps=self.lamps,
                 window=parse_window(self.crop, self.scale),
-                needs_lights=not self.finds_lights,
+                needs_lights=needs_lights,
                 lights_in_channels=self.lights_in_channels,
                 crosstalk=self.crosstalk,
             ),
@@ -560,6 +596,10 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
                 given = records.option_of(kind)
                 found[records.long_name(name, given) if given else "--maps"] = True
         return list(found)
+
+    @property
+    def may_find_lights(self) -> bool:
+        return super().may_find_lights and not self.refine_lights
 
     @property
     def recipe(self) -> RecipeOptions:

@@ -44,18 +44,18 @@ def describe_capture(
     the images, or options contradict.
     """
     reading, plot, mended_lights = reading or ReadingOptions(), options.plot, options.mended_lights
-    for name, given in (
-        ("--check-lights", options.check_lights),
-        ("--mended-lights", mended_lights is not None),
-    ):
-        if given and reading.finds_lights:
-            raise UsageError(
-                f"{name} checks a light file, and --lights estimate reads none",
-                hint="Leave one out",
-            )
     with TemporaryDirectory() as frames:  # extracted from a film
         folder = unpacked(options.capture, Path(frames), reading, observer, redo="all")
         source = reading.open(folder)
+        for name, given in (
+            ("--check-lights", options.check_lights),
+            ("--mended-lights", mended_lights is not None),
+        ):
+            if given and not source.has_lights:
+                raise UsageError(
+                    f"{name} checks a light file, and the lights are estimated without one",
+                    hint="Give --lights FILE, or leave it out",
+                )
         _check_outputs(options, source)
         work = begin(source, None, replace(reading.recipe, auto_mask=options.auto_mask))
         n_reads = images_to_read(work)
@@ -249,6 +249,7 @@ def _report(work: Work, n_reads: int) -> dict[str, Any]:
         ],
         "reads": source.window.in_words(),
         "n_pixels": capture.n_pixels,
+        "light_source": "given" if found is None else "estimated",
         "light_directions": text(files.light_directions),
         "estimated_lights": found,
         "lamps": None if source.lamps is None else source.lamps.in_words(),

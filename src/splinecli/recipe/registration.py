@@ -78,7 +78,7 @@ def register(work: Work, advance: Callable[[], object]) -> Work:
         raise InputError(problem, path=folder, hint=hint)
     read = seen.read_pixels(np.ones_like(mask), indices, StoredPixels.observe, advance)
     images = np.stack([reduced(image.reshape(mask.shape), stride) for image in read])
-    lights = None if work.options.finds_lights else source.light_directions[indices]
+    lights = None if work.finds_lights else source.light_directions[indices]
     found = align_images(images, small, lights)
     _check_explained(found, names, source, stride)
     left, top, *_ = source.window.box or (0, 0)

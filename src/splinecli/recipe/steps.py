@@ -67,7 +67,7 @@ def _with_colours(
 def find_mask(work: Work, advance: Callable[[], object]) -> Work:
     """Find the object in all images of the source; see find_object.
 
-    Raises InputError if no object stands out.
+    Raises InputError if no object stands out, and the mask was requested.
     """
     source = work.files
     shape = common_size(source.facts)[0][:2]  # of all images
@@ -77,8 +77,10 @@ def find_mask(work: Work, advance: Callable[[], object]) -> Work:
     for colours in source.read_pixels(everywhere, every, StoredPixels.colours, advance):
         total += colours.mean(axis=1)
     try:
-        mask = find_object(total.reshape(everywhere.shape))
+        mask = find_object(total.reshape(everywhere.shape), is_requested=work.options.auto_mask)
     except InputError as error:
+        if not work.options.auto_mask:
+            return work
         raise InputError(error.problem, path=source.files.folder, hint=error.hint) from None
     if source.alignment is not None:
         mask &= source.alignment.common
@@ -141,7 +143,7 @@ def find_lights(work: Work, _: Callable[[], object]) -> Work:
     Raises InputError if the images do not determine the lights, or the estimated lights cannot give
     normals.
     """
-    from splinecli.estimate.light_search import search_lights
+    from splinecli.estimate.light_descent import best_lights
     from splinecli.lights.unknown_lights import find_lights
 
     capture, options = work.made, work.options
@@ -150,17 +152,25 @@ def find_lights(work: Work, _: Callable[[], object]) -> Work:
             capture.observations,
             capture.mask,
             work.source.intensities_known,
-            search_lights,
+            best_lights,
             first_light=options.first_light,
+            first_image=work.source.image_names(work.indices)[0],
             refuse=options.refuses_lights,
         )
     except InputError as error:
-        raise InputError(f"{capture.name}: {error.problem}", hint=error.hint) from None
+        problem, hint = error.problem, error.hint
+        if not options.finds_lights:
+            problem = f"found no light file, and {problem}"
+            hint = f"Add --lights FILE if you have measured the lights. {hint}"
+        raise InputError(f"{capture.name}: {problem}", hint=hint) from None
     capture = replace(
         capture,
         light_directions=found.directions,
         light_errors_deg=found.errors_deg,
-        warnings=(*capture.warnings, estimated_lights(found.errors_deg)),
+        warnings=(
+            *capture.warnings,
+            estimated_lights(found.errors_deg, requested=options.finds_lights),
+        ),
     )
     return replace(work, capture=capture, found_intensities=found.intensities)
 
@@ -292,7 +302,13 @@ def _mends(work: Work) -> bool:
 
 
 def _finds_mask(work: Work) -> bool:
-    return work.options.auto_mask and not work.source.has_mask
+    return (work.options.auto_mask or _needs_outline(work)) and not work.source.has_mask
+
+
+def _needs_outline(work: Work) -> bool:
+    """Whether a mask is tried, because the outline helps to estimate lights."""
+    options = work.options
+    return work.finds_lights and options.refuses_lights and options.first_light is None
 
 
 def _used(work: Work) -> int:
@@ -332,7 +348,7 @@ STEPS = (
         "finding the object",
     ),
     Step("observations", observe, n_images=_used, note="reading"),
-    Step("lights", find_lights, lambda work: work.options.finds_lights),
+    Step("lights", find_lights, lambda work: work.finds_lights),
     Step("intensities", divide_by_intensities, lambda work: not work.options.as_stored),
     Step("saturation", restore, lambda work: not work.options.as_stored),
     Step("judgement", judge, lambda work: work.options.judges),

@@ -73,6 +73,13 @@ class Work:
     judgement: Judgement | None = None
 
     @property
+    def finds_lights(self) -> bool:
+        """Whether the lights are estimated from the images: because this was requested, or because
+        the capture has no light file.
+        """
+        return self.options.finds_lights or not self.source.has_lights
+
+    @property
     def made(self) -> Capture:
         """The capture, which exists once the step `observations` was run."""
         assert self.capture is not None

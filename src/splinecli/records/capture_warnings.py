@@ -365,11 +365,17 @@ def lights_mended(cause: str, *, in_files: bool = True) -> CaptureWarning:
     return CaptureWarning(LIGHTS_MENDED, text)
 
 
-def estimated_lights(errors_deg: Float64Array) -> CaptureWarning:
-    """Report that the light directions were estimated, with expected errors (F,) in degrees."""
+def estimated_lights(errors_deg: Float64Array, *, requested: bool) -> CaptureWarning:
+    """Report that the light directions were estimated, with expected errors (F,) in degrees,
+    because this was requested or because there is no light file.
+    """
+    why, way_out = "", ""
+    if not requested:
+        why = ", because the capture has no light file"
+        way_out = " If you have measured the lights, add --lights FILE."
     return CaptureWarning(
         ESTIMATED_LIGHTS,
-        "The light directions were estimated from the images. Their expected error is"
+        f"The light directions were estimated from the images{why}. Their expected error is"
         f" {errors_deg.mean():.0f} degrees on average and {errors_deg.max():.0f} degrees for the"
-        " worst one; the normals inherit these errors.",
+        f" worst one; the normals inherit these errors.{way_out}",
     )

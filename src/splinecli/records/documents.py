@@ -121,6 +121,7 @@ class EstimateReport(Document):
     weights: UsedWeights | None
     n_lights: LightCount
     light_indices: list[Natural]
+    light_source: Literal["given", "estimated"]
     light_file: str | None
     light_directions: list[Vector]
     light_errors_deg: list[NotNegative] | None

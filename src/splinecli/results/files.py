@@ -69,6 +69,7 @@ def report_of(
         weights=None if estimator.weights is None else UsedWeights(**estimator.weights),
         n_lights=capture.n_lights,
         light_indices=list(capture.light_indices),
+        light_source="given" if light_errors_deg is None else "estimated",
         light_file=None if light_file is None else str(light_file.absolute()),
         light_directions=capture.light_directions.round(6).tolist(),
         light_errors_deg=None if light_errors_deg is None else light_errors_deg.round(2).tolist(),

@@ -22,7 +22,7 @@ from torch.nn.functional import normalize
 from splinecli.estimate.methods import DEFAULT_METHOD
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import resolve_weights
-from splinecli.lights.least_curl import OPPOSITE, Lights, SearchedLights
+from splinecli.lights.least_curl import OPPOSITE, BestLights, Lights
 from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.pixel_grid import Blocks
@@ -39,7 +39,7 @@ _LEAST_Z, _LEAST_LIGHT_Z = 0.2, 0.05
 _INTENSITY_SPREAD = 0.3
 
 
-def search_lights(
+def best_lights(
     observations: Floats,
     mask: Bools,
     starts: Sequence[Lights],
@@ -48,7 +48,7 @@ def search_lights(
     errors_deg: Float64Array,
     *,
     intensities_known: bool,
-) -> SearchedLights:
+) -> BestLights:
     """Return the best lights near one of the starts.
 
     The observations (P, F) are linear, divided by the light intensities if these are known. The
@@ -95,7 +95,7 @@ def search_lights(
         directions, intensities = unit(start.directions @ move), start.intensities.copy()
         directions[used], intensities[used] = lights
         lights = Lights(directions, intensities)
-    return SearchedLights(lights, best, found[best].expected, found[best].curl)
+    return BestLights(lights, best, found[best].expected, found[best].curl)
 
 
 class _Followed(NamedTuple):
