@@ -48,8 +48,24 @@ def test_infer(unlit, run, document):
     )
 
 
-def test_the_message_about_a_missing_light_file_names_it(unlit, run):
-    run(f"infer {unlit}", code=3, says=("--lights estimate", "splinecli calibrate"))
+def test_lights_are_estimated_if_there_is_no_light_file(unlit, run, document):
+    """With the mask found in the images, if there is none, and only where nobody asks for more."""
+    (unlit / "mask.png").unlink()
+    report = document(f"infer {unlit} --method ls")
+    assert "because the capture has no light file" in str(report["warnings"])
+    assert report["light_source"] == "estimated"
+    assert angle_between_deg(np.loadtxt("out/ball/light_directions.txt"), LIGHTS).mean() < 5
+    assert Path("out/ball/mask.png").exists()
+    info = document(f"info {unlit}")
+    assert info["light_source"] == "estimated" and info["mask"] == "found in the images"
+    for options in ("--strict", "--light-frame x-left", "--refine-lights", "--light-distance 90"):
+        says = ("--lights estimate", "splinecli calibrate")
+        run(f"infer {unlit} {options} -o other", code=3, says=says)
+    run(f"infer {unlit} --lights none.txt -o other", code=3, says="none.txt")
+    for image in sorted(unlit.glob("*.png"))[5:]:
+        image.unlink()
+    run(f"infer {unlit} -o other", code=3, says="5 images")
+    assert not Path("other").exists()
 
 
 def test_a_light_file_of_the_user_is_kept(unlit, run):
@@ -95,13 +111,14 @@ def test_first_light(unlit, run):
     (unlit / "mask.png").unlink()
     crop = f"infer {unlit} --crop 16,16,32,32 --lights estimate --method ls"
     for command in (crop, f"info {unlit} --crop 16,16,32,32 --lights estimate"):
-        says = ("--auto-mask", "--first-light left, upper-left, or its azimuth")
+        says = ("--mask FILE", "the light of 000.png comes from: --first-light left, upper-left")
         result = run(command, code=3, says=says)
-        assert result.err.startswith("splinecli: ball: the images do not show the outline")
+        assert result.err.startswith("splinecli: ball: the images do not show whether")
     side = str(np.degrees(np.arctan2(LIGHTS[0, 1], LIGHTS[0, 0])))
     run(f"{crop} --first-light {side}")
     assert angle_between_deg(np.loadtxt("out/ball/light_directions.txt"), LIGHTS).mean() < 15
-    run(f"infer {unlit} --first-light {side}", code=2, says="--first-light needs --lights estimate")
+    np.savetxt(unlit / "light_directions.txt", LIGHTS)
+    run(f"infer {unlit} --first-light {side} -o given", code=2, says="Add --lights estimate")
     words = "the first light comes from 'north'; expected one of right,"
     run(f"{crop} --first-light north", code=2, says=words)
 
@@ -113,11 +130,11 @@ def test_contradictions(unlit, run):
         "infer --light-frame x-left",
         "infer --light-format azel",
         "infer --refine-lights",
-        "info --check-lights",
         "evaluate --refine-lights",
         "evaluate --light-noise-deg 2",
     ):
         run(f"{command} {unlit} --lights estimate", code=2, says="--lights estimate")
+    run(f"info {unlit} --check-lights", code=2, says="the lights are estimated without one")
     assert not Path("out").exists()
 
 
@@ -162,7 +179,7 @@ def test_films_that_cannot_be_used(run):
     film = write_film(Path("clip.avi"), sphere_film(np.repeat(path_of_lamp(1), 10, axis=0)))
     film.with_name("...mp4").write_bytes(film.read_bytes())
     for code, arguments, words in (
-        (2, film, "Add --lights estimate"),
+        (2, f"{film} --light-frame x-left", "Leave out options about lights that are given"),
         (
             3,
             f"{film} --lights estimate",
