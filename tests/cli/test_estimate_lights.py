@@ -55,7 +55,7 @@ def test_lights_are_estimated_if_there_is_no_light_file(unlit, run, document):
     assert "because the capture has no light file" in str(report["warnings"])
     assert report["light_source"] == "estimated"
     assert angle_between_deg(np.loadtxt("out/ball/light_directions.txt"), LIGHTS).mean() < 5
-    assert Path("out/ball/mask.png").exists()
+    assert Path("out/ball/found_mask.png").exists()
     info = document(f"info {unlit}")
     assert info["light_source"] == "estimated" and info["mask"] == "found in the images"
     for options in ("--strict", "--light-frame x-left", "--refine-lights", "--light-distance 90"):
