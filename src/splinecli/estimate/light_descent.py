@@ -29,14 +29,15 @@ from splinecli.maths.pixel_grid import Blocks
 from splinecli.system.machine import in_order, one_thread_each
 
 _GRID_PIXELS, _MOST_LIGHTS = 500, 30
-_STEPS, _STEP, _OWN_STEP = 14, 0.04, 0.01  # in common, and of each light by itself
-_CURL, _NEAR = (
-    1.5,
-    1.0,
-)  # weights of the curl and of the start, in units of a logarithm of the error
+_STEPS, _STEP, _OWN_STEP = 14, 0.06, 0.01  # in common, and of each light by itself
+# Weights, in units of the logarithm of the expected error: of the curl of the normals, of the
+# distance from the start, and of the spread of the albedo, which unknown intensities would tilt
+# (Alldrin, Mallick and Kriegman, "Resolving the generalized bas-relief ambiguity by entropy
+# minimization", CVPR 2007).
+_CURL, _NEAR, _ALBEDO = 1.5, 0.5, 1.0
 _CURL_TO_CHOOSE, _GUESS_TO_CHOOSE, _FIRST_TO_CHOOSE = 2.0, 0.3, 0.3
-_LEAST_Z, _LEAST_LIGHT_Z = 0.2, 0.05
-_INTENSITY_SPREAD = 0.3
+_LEAST_Z, _LEAST_LIGHT_Z, _LEAST_COSINE = 0.2, 0.05, 0.2
+_INTENSITY_SPREAD = 0.3  # standard deviation of the logarithm, of each intensity by itself
 
 
 def best_lights(
@@ -134,14 +135,23 @@ class _Images:
         scaled = torch.tensor(values / max(float(typical), 1e-12), dtype=torch.float32)
         return cls(scaled, torch.from_numpy(bright), torch.from_numpy(neighbours))
 
-    def judge(self, directions: Tensor, log_intensities: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the mean logarithm of the errors that the network expects under lights, and the
-        curl of its normals.
+    def judge(self, directions: Tensor, log_intensities: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the mean logarithm of the errors that the network expects under lights, the curl
+        of its normals, and the spread of the logarithm of the albedo that these leave.
         """
-        normals, error = _network()(self.values / log_intensities.exp(), directions)
-        expected = error[self.bright, 0].mean()
+        observed = self.values / log_intensities.exp()
+        normals, error = _network()(observed, directions)
+        cosines = (normals @ directions.T).clamp(min=0)
+        # Shadows and highlights are dark and bright outliers.
+        lit = (cosines > _LEAST_COSINE).float()
+        fitted = (lit * observed * cosines).sum(dim=1) / (lit * cosines**2).sum(dim=1).clamp(1e-6)
+        albedo = fitted[self.bright].clamp(min=1e-6).log()
+        spread = (albedo - albedo.median()).abs().mean()
+        return error[self.bright, 0].mean(), self._curl(normals), spread
+
+    def _curl(self, normals: Tensor) -> Tensor:
         if not self.neighbours.shape[1]:
-            return expected, expected.new_ones(())
+            return normals.new_ones(())
         z = normals[:, 2].clamp(min=_LEAST_Z)
         slopes = -normals[:, :2] / z[:, None]
         here, right, left, above, below = self.neighbours
@@ -153,7 +163,7 @@ class _Images:
         largest = size.detach().quantile(0.95)
         weights = z[here] ** 3 * (normals[here, 2] > _LEAST_Z)
         total = (weights * torch.minimum(size, largest)).sum().clamp(min=1e-6)
-        return expected, (weights * torch.minimum(curl, largest)).sum() / total
+        return (weights * torch.minimum(curl, largest)).sum() / total
 
 
 @cache
@@ -174,19 +184,26 @@ def _follow(
     began = torch.tensor(unit(directions), dtype=torch.float32)
     common, own = torch.zeros(3, 3, requires_grad=True), torch.zeros_like(began, requires_grad=True)
     logs = torch.tensor(np.log(start.intensities), dtype=torch.float32)
+    own_logs = torch.zeros_like(logs, requires_grad=not intensities_known)
     steps = {common: _STEP, own: _OWN_STEP}
     if not intensities_known:
-        steps[logs.requires_grad_()] = 2 * _OWN_STEP
+        steps[own_logs] = 2 * _OWN_STEP
     descent = torch.optim.Adam([{"params": [each]} for each in steps], betas=(0.7, 0.9))
     best, least = _Followed(start, 0.0, 1.0), np.inf
     for number in range(_STEPS + 1):
-        lights = normalize(began @ (torch.eye(3) + common) + own, dim=1)
-        relative = logs - logs.mean()
-        expected, curl = images.judge(lights, relative)
+        vectors = began @ (torch.eye(3) + common) + own
+        lights = normalize(vectors, dim=1)
+        relative = logs
+        if not intensities_known:  # a matte surface has the same images under these
+            relative = logs + own_logs + vectors.norm(dim=1).log()
+            relative = relative - relative.mean()
+        expected, curl, spread = images.judge(lights, relative)
         near = torch.log1p(((lights - began) / errors[:, None]).square().sum(dim=1) / 2).mean()
-        near = near + 0.5 * (relative / _INTENSITY_SPREAD).square().mean()
+        near = near + 0.5 * (own_logs / _INTENSITY_SPREAD).square().mean()
         low = (_LEAST_LIGHT_Z - lights[:, 2]).clamp(min=0).square().sum()
         cost = expected + _CURL * (curl + 0.02).log() + _NEAR * near + 100 * low
+        if not intensities_known:
+            cost = cost + _ALBEDO * (spread + 0.05).log()
         if cost.item() < least:
             least = cost.item()
             found = Lights(
