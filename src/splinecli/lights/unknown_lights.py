@@ -138,7 +138,7 @@ def _entropy(scaled_normals: Float64Array) -> float:
 
 
 # mean expected error of lights; larger ones are refused, as their normals would be useless
-LARGEST_ERROR_DEG = 20.0
+LARGEST_ERROR_DEG = 25.0
 _MOST_PIXELS = 4_000_000  # of a larger capture, some rows and columns are left out
 _VIEWS = [(turns, mirrored) for turns in range(4) for mirrored in (False, True)]
 _OTHER_DEG = 4.0  # lights that differ by less lead a search to the same lights
