@@ -29,6 +29,7 @@ from splinecli.judge.checks import TILT_ADVICE, check_confidence, refuse_if_stri
 from splinecli.judge.tilt import find_tilt
 from splinecli.lights.draws import draw_lights
 from splinecli.maths import Bools, Float32Array
+from splinecli.pictures.capture_sheet import sheet_of
 from splinecli.pictures.maps import encode_png
 from splinecli.pictures.plots import sky_plot
 from splinecli.pipeline.expected_seconds import AUTOMATIC_FROM, expected_seconds
@@ -48,6 +49,7 @@ from splinecli.records.capture_warnings import (
 )
 from splinecli.records.output_files import (
     BYTES_OF_SURFACE,
+    CAPTURE_SHEET,
     FOUND_LIGHTS,
     FOUND_MASK,
     MAPS,
@@ -80,6 +82,15 @@ BASE_BYTES = 500 * 2**20
 # most pixels refined at once (a tile with its margin); bytes per pixel
 REFINED_PIXELS, REFINED_BYTES = (736**2, 1100)
 
+
+_SHEET_CAPTION = (
+    "The images as they are used, each with its light; the rim of the disc is at 90° from the"
+    " camera axis"
+)
+_LIGHTS_CAPTION = (
+    "The lights that were found, around the camera axis; circles have the radius of their expected"
+    " errors"
+)
 
 # A network follows a tilt of its lights only in part, so that it is undone in steps, of which each
 # reduces the curl to the share or less.
@@ -475,9 +486,11 @@ def _make_files(
         files.normal_files(estimate, options.formats, options.convention),
         *map(map_of, chosen_maps(options.maps)),
     ]
-    light_plot = None
+    pictures = {_SHEET_CAPTION: sheet_of(source, capture)}
+    found.append([(CAPTURE_SHEET, pictures[_SHEET_CAPTION])])
     if (errors_deg := capture.light_errors_deg) is not None:
         light_plot = sky_plot(capture.light_directions, capture.name, errors_deg=errors_deg)
+        pictures[_LIGHTS_CAPTION] = light_plot
         found.append(files.light_files(capture, light_plot))
     if source.automatic_mask is not None:
         found.append([(FOUND_MASK, encode_png(source.window.filled(capture.mask) * np.uint8(255)))])
@@ -503,7 +516,7 @@ def _make_files(
             values={name: made[name] for name, row in MAPS.items() if name in made and row.caption},
             material=made.get("material"),
             error_map_deg=estimate.error_map_deg,
-            light_plot=light_plot,
+            pictures=pictures,
         )
         found.append([(PAGE, page)])
     return found

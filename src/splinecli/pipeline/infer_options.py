@@ -732,4 +732,10 @@ class InfoOptions(Display, frozen=True, kw_only=True):
         "FILE",
     )
     plot: Path | None = option("Output", "Also plot the light directions to a PNG file.", "FILE")
+    output: FileName | None = option(
+        "Output",
+        "Write OUT/<capture name>/capture.png, a contact sheet of the images with their lights.",
+        "OUT",
+        names=OUTPUT,
+    )
     overwrite: bool = flag("Output", "Replace an earlier plot or file of lights.")

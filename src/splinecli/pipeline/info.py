@@ -13,6 +13,7 @@ from splinecli.capture.light_files import encode_lights, light_encoder
 from splinecli.errors import UsageError
 from splinecli.judge.light_check import candidate_rows
 from splinecli.lights.calibration.balls import find_view
+from splinecli.pictures.capture_sheet import sheet_of
 from splinecli.pictures.plots import sky_plot
 from splinecli.pipeline.expected_seconds import expected_seconds
 from splinecli.pipeline.incoming import unpacked
@@ -21,6 +22,7 @@ from splinecli.pipeline.infer_options import InfoOptions, ReadingOptions
 from splinecli.recipe.steps import begin, follow, images_to_read
 from splinecli.recipe.work import Work
 from splinecli.records.capture_warnings import LIGHTS_MENDED
+from splinecli.records.output_files import CAPTURE_SHEET
 from splinecli.system.files import check_free, write_bytes
 from splinecli.system.progress import SILENT, Observer
 
@@ -67,6 +69,9 @@ def describe_capture(
             errors_deg = capture.light_errors_deg
             picture = sky_plot(capture.light_directions, capture.name, errors_deg=errors_deg)
             write_bytes(plot, picture)
+        if options.output is not None:
+            sheet = Path(options.output) / capture.name / CAPTURE_SHEET
+            write_bytes(sheet, sheet_of(work.files, capture))
         check, warnings = judgement.light_check, [*capture.warnings, *judgement.warnings]
         for warning in warnings:
             observer.warn(str(warning))
@@ -194,6 +199,9 @@ def _check_outputs(options: InfoOptions, source: CaptureSource) -> None:
             )
             raise UsageError(problem, hint="Choose another folder for it")
         check_free(plot.parent, [plot.name], overwrite=options.overwrite)
+    if options.output is not None:
+        folder = Path(options.output) / source.name
+        check_free(folder, [CAPTURE_SHEET], overwrite=options.overwrite)
     if mended_lights is not None:
         light_encoder(mended_lights)
         if source.lamps is not None and source.lamps.used:

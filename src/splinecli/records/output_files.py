@@ -23,6 +23,7 @@ NORMALS = {
 
 ERROR_MAP, GLOSS = "error_map.png", "metallic_roughness.png"
 REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
+CAPTURE_SHEET = "capture.png"  # what was taken for what; also of `info`
 # With the lights estimated by `infer`. If results and capture share a folder, they may be the
 # user's own.
 FOUND_LIGHTS = ("light_directions.txt", "light_intensities.txt", "lights.png")
@@ -206,4 +207,5 @@ def own_files() -> list[str]:
     """
     maps = (name for row in MAPS.values() for name in row.files.values())
     surface = (*file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS, SURFACE_REPORT)
-    return [*NORMALS.values(), ERROR_MAP, *maps, *surface, FOUND_MASK, PAGE, REPORT]
+    own = (FOUND_MASK, CAPTURE_SHEET, PAGE, REPORT)
+    return [*NORMALS.values(), ERROR_MAP, *maps, *surface, *own]

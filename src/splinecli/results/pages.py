@@ -65,7 +65,7 @@ def result_page(
     values: Mapping[str, Float32Array] | None = None,
     material: Float32Array | None = None,
     error_map_deg: Float32Array | None = None,
-    light_plot: bytes | None = None,
+    pictures: Mapping[str, bytes] | None = None,
 ) -> str:
     """Return one HTML file that contains everything it shows and loads nothing from a network.
 
@@ -85,7 +85,7 @@ def result_page(
         material: (H, W, 7), see splinecli.results.material; determines how the page reflects light.
             None for the albedo and a highlight that the reader sets.
         error_map_deg: (H, W) degrees, NaN where the error is unknown.
-        light_plot: a PNG of the lights, if they were estimated from the images.
+        pictures: further pictures (PNG), each with its caption as the key.
     """
     normals, shown = _reduce(normal_map, mask, LARGEST_MAP)
     values = values or {}
@@ -137,7 +137,7 @@ def result_page(
         captions=captions,
         exposure=exposure,
         error_map=error_png,
-        light_plot=None if light_plot is None else picture_url(light_plot),
+        pictures={caption: picture_url(png) for caption, png in (pictures or {}).items()},
         error_colours=", ".join(f"rgb({r} {g} {b})" for r, g, b in stops),
         error_ticks=[f"{value:g}°" for value in TICKS],
     )
