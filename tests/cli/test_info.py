@@ -131,7 +131,7 @@ def test_auto_mask(document, capture):
     assert (report["mask"], report["n_pixels"]) == ("found in the images", 24 * 16)
 
 
-def test_the_contact_sheet_is_that_of_infer(run, document):
+def test_the_contact_sheet_is_that_of_infer(sphere, run, document):
     """A picture that is left out is on it, too."""
     assert cv2.imwrite("sphere/photo_albedo.png", np.zeros((9, 9), np.uint8))
     report = document("infer sphere --method ls --html")
