@@ -115,6 +115,26 @@ def pgm_and_stack_captures(folder: Path) -> None:
     tifffile.imwrite(folder / "stack/stack.tif", pictures, photometric="minisblack")
 
 
+def mat_captures(folder: Path) -> None:
+    """Photographs, mask and lights in one .mat file, and lamps of near_ps."""
+    pictures = np.stack([shaded(light) for light in LIGHTS], axis=-1)
+    mask = np.ones(SHAPE, np.uint8)
+    for name, arrays in (
+        ("array", {"I": pictures, "S": LIGHTS.T, "mask": mask}),
+        ("numbered", {f"im{number}": pictures[..., number] for number in range(len(LIGHTS))}),
+    ):
+        (folder / name).mkdir()
+        savemat(folder / name / "a.mat", arrays, do_compression=name == "array")
+    np.savetxt(folder / "numbered/lights.txt", LIGHTS)
+    (folder / "lamps").mkdir()
+    for number, light in enumerate(LIGHTS):
+        write_image(folder / f"lamps/{number}.png", shaded(light))
+    count = (len(LIGHTS), 1)
+    lamps = {"S": 100 * LIGHTS * (1, -1, -1) + (0, 0, 500), "Dir": -LIGHTS * (1, -1, -1)}
+    savemat(folder / "lamps/light.mat", lamps | {"mu": np.ones(count), "Phi": np.full(count, 9e3)})
+    savemat(folder / "lamps/camera.mat", {"K": np.array([[500, 0, 9], [0, 500, 8], [0, 0, 1.0]])})
+
+
 def light_files(folder: Path) -> None:
     """Light files of every form, and near lamps."""
     for number, light in enumerate(LIGHTS):
@@ -134,6 +154,8 @@ def light_files(folder: Path) -> None:
     )
     (folder / "list.json").write_text(json.dumps(LIGHTS.tolist()))
     lights = [dict(zip("xyz", light, strict=True)) for light in LIGHTS.tolist()]
+    objects = [{"file": f"{n}.png", "light_dir": light} for n, light in enumerate(LIGHTS.tolist())]
+    (folder / "objects.json").write_text(json.dumps({"version": 1, "images": objects}))
     (folder / "rig.dome").write_text(json.dumps({"directions": lights, "positionsSphere": lights}))
     np.savetxt(folder / "positions.txt", 60 * LIGHTS)
     np.savetxt(folder / "light_lobes.txt", np.column_stack((-LIGHTS, np.full(len(LIGHTS), 2))))
@@ -291,13 +313,23 @@ TARGETS = (
         (*each("infer {} --method ls -o out --overwrite", "pgm stack"), "info stack"),
     ),
     Target(
+        "mat",
+        mat_captures,
+        ("*/*.mat",),
+        (
+            *each("infer {} --method ls -o out --overwrite", "array numbered"),
+            "infer lamps --pixel-size 1 --method ls -o out --overwrite",
+            "info array",
+        ),
+    ),
+    Target(
         "lights",
         light_files,
         ("*.txt", "*.npy", "*.csv", "*.json", "*.dome"),
         (
             *each(
                 "infer . --method ls --lights {} -o out --overwrite",
-                "vectors.npy utf16.txt commas.txt named.csv list.json rig.dome",
+                "vectors.npy utf16.txt commas.txt named.csv list.json objects.json rig.dome",
             ),
             "infer . --method ls --lights azel.txt --light-format azel -o out --overwrite",
             "infer . --method ls --light-positions positions.txt --pixel-size 1 --camera-matrix"

@@ -176,6 +176,7 @@ def _parts(content: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
 _PICTURES = ("i", "im", "ims", "img", "imgs", "image", "images", "photos", "stack", "data")
 _MASKS = ("mask", "m", "msk")
 _MOST_FILES = 4  # whose tables are kept
+_MOST_PICTURES = 9_999  # whose numbers page_of reads
 
 
 @dataclass(frozen=True)
@@ -231,6 +232,7 @@ def _find_stack(path: Path, *_: int) -> Stack | None:
     for (_, shape), group in _numbered(found).items():
         if min(shape[:2]) > 3 and (len(shape) == 2 or shape[2:] == (3,)):
             stacks.append((False, Stack(tuple(group), "HWC"[: len(shape)], None)))
+    stacks = [each for each in stacks if each[1].count <= _MOST_PICTURES]
     stacks = [each for each in stacks if each[0] == min(unusual for unusual, _ in stacks)]
     if len(stacks) != 1:
         return None
