@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from splinecli.capture.formats.images import ExpectedSize, read_image
@@ -131,13 +130,15 @@ def find_reference(images: Sequence[Path]) -> Path | None:
     named = [image for image in images if _REFERENCE.search(image.stem.lower())]
     if named:
         return named[0] if len(named) == 1 else None
-    logarithms = []
+    import cv2
+
+    logarithms: list[Float32Array] = []
     for image in images:
         expected = ExpectedSize(logarithms[0].shape, images[0].name) if logarithms else None
         smooth = cv2.GaussianBlur(read_image(image, expected), (0, 0), 1.5)
         logarithms.append(np.log(np.maximum(smooth.reshape(*smooth.shape[:2], -1), 0.02)))
-    slopes = [np.abs(np.diff(each, axis=0)).mean() for each in logarithms]
-    first, second = np.argsort(slopes)[:2].tolist()
+    slopes = [float(np.abs(np.diff(each, axis=0)).mean()) for each in logarithms]
+    first, second, *_ = sorted(range(len(slopes)), key=slopes.__getitem__)
     if slopes[first] > _FLATTEST * slopes[second]:
         return None
     for other in logarithms[:first] + logarithms[first + 1 :]:

@@ -317,28 +317,7 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
     if lights is None and overrides.needs_lights:
         lights, warnings = search_lights(folder, images)
     if lights is None and overrides.needs_lights:
-        option = light_option([folder, of_images, _parent(folder)], images)
-        hint = (
-            "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes"
-            " the file from images of a mirror ball. Without one, --lights estimate finds them"
-            " from the images, with lower accuracy"
-        )
-        found = f"1 image ({images[0].name})"
-        if len(images) > 1:
-            found = f"{len(images)} images ({files.short_list(images)})"
-        if len(images) < MIN_LIGHTS:
-            hint = (
-                "A normal needs at least three photographs under different lights; a colour"
-                " photograph under three coloured lamps is read with --lights-in-channels"
-            )
-            hint, option = f"{hint} {option or '--lights FILE'}", None
-        raise (InputError if option else NoLightsError)(
-            f"found {found} but no light file",
-            folder,
-            hint=f"Add {option}"
-            if option
-            else f"{hint}. These light files are found by name: {light_names()}",
-        )
+        raise _no_lights(folder, images)
     layout, ground_truth = "plain folder", files.GROUND_TRUTH
     if listed and files.find_named(folder, ["light_directions.txt"]) is not None:
         # normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
@@ -346,6 +325,30 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
     found = _gather(layout, folder, images, lights, overrides, ground_truth, others)
     of_copies = () if listed else copies(images)
     return replace(found, name=name, warnings=(*warnings, *found.warnings, *of_copies))
+
+
+def _no_lights(folder: Path, images: Sequence[Path]) -> InputError:
+    """Return the error that names the options with which a capture without a light file is read: a
+    NoLightsError if the images may do without.
+    """
+    option = light_option([folder, images[0].parent, _parent(folder)], images)
+    count = "1 image" if len(images) == 1 else f"{len(images)} images"
+    problem = f"found {count} ({files.short_list(images)}) but no light file"
+    if len(images) < MIN_LIGHTS:
+        hint = (
+            "A normal needs at least three photographs under different lights; a colour photograph"
+            f" under three coloured lamps is read with --lights-in-channels {option or ''}"
+        )
+        return InputError(problem, folder, hint=hint.rstrip())
+    if option:
+        return InputError(problem, folder, hint=f"Add {option}")
+    hint = (
+        "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes"
+        " the file from images of a mirror ball. Without one, --lights estimate finds them"
+        " from the images, with lower accuracy. These light files are found by name:"
+        f" {light_names()}"
+    )
+    return NoLightsError(problem, folder, hint=hint)
 
 
 def _find_psbox(folder: Path, overrides: files.Overrides) -> files.CaptureFiles | None:

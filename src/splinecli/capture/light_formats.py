@@ -304,11 +304,11 @@ def _choose(
     if len(lights) > 1:
         usual = (n_images, 3), (3, n_images)
         lights = {name: shape for name, shape in lights.items() if shape in usual} or lights
-    named = [name for name in lights if name.lower() in _LIGHT_NAMES]
+    usual_names = [name for name in lights if name.lower() in _LIGHT_NAMES]
     if set(lights) >= NEAR_PS and form == "positions":
         return "S"
-    if len(lights) > 1 and named and not set(lights) >= NEAR_PS:
-        return min(named, key=lambda name: _LIGHT_NAMES.index(name.lower()))
+    if len(lights) > 1 and usual_names and not set(lights) >= NEAR_PS:
+        return min(usual_names, key=lambda name: _LIGHT_NAMES.index(name.lower()))
     if len(lights) == 1:
         return next(iter(lights))
     sizes = [

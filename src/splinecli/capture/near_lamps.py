@@ -466,7 +466,7 @@ def _path(name: str | None) -> Path | None:
 def read_camera_matrix(path: Path) -> Float64Array:
     """Return the camera matrix (3, 3) of a text file, or K of a .mat file. Raises InputError."""
     if path.suffix.lower() == ".mat":
-        matrix = np.float64(_matrix_of(path, "K"))
+        matrix: Float64Array = np.asarray(_matrix_of(path, "K"), np.float64)
     else:
         matrix = read_number_rows(path).as_array()
     if matrix.shape != (3, 3):

@@ -223,7 +223,7 @@ def _find_stack(path: Path, *_: int) -> Stack | None:
     counts = {n for v in found if len(v.shape) == 2 and 3 in v.shape for n in v.shape}
     masks = [v for v in found if len(v.shape) == 2 and v.name.lower() in _MASKS]
     size = masks[0].shape if len(masks) == 1 else None
-    stacks = []
+    stacks: list[tuple[bool, Stack]] = []  # each with whether its name is unusual
     for variable in found:
         axes = _axes(variable.shape, counts, size)
         usual = variable.name.lower() in _PICTURES
@@ -233,12 +233,11 @@ def _find_stack(path: Path, *_: int) -> Stack | None:
         if min(shape[:2]) > 3 and (len(shape) == 2 or shape[2:] == (3,)):
             stacks.append((False, Stack(tuple(group), "HWC"[: len(shape)], None)))
     stacks = [each for each in stacks if each[1].count <= _MOST_PICTURES]
-    stacks = [each for each in stacks if each[0] == min(unusual for unusual, _ in stacks)]
-    if len(stacks) != 1:
+    likely = [stack for unusual, stack in stacks if unusual == all(each for each, _ in stacks)]
+    if len(likely) != 1:
         return None
-    _, stack = stacks[0]
-    fits = size == stack.shape[:2]
-    return Stack(stack.arrays, stack.axes, masks[0] if fits else None)
+    (stack,) = likely
+    return Stack(stack.arrays, stack.axes, masks[0] if size == stack.shape[:2] else None)
 
 
 def _axes(shape: tuple[int, ...], counts: set[int], size: tuple[int, ...] | None) -> str | None:

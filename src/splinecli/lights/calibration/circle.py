@@ -157,7 +157,7 @@ def _brightened(image: Array) -> Float32Array:
     values = image.astype(np.float32)
     # Many images show a dark ball in front of a dark background. Clipping the brightest 1 % brings
     # out its edge.
-    return np.sqrt(values / max(float(np.quantile(values, 0.99)), 1e-9)).clip(0, 1)
+    return np.asarray(np.sqrt(values / max(float(np.quantile(values, 0.99)), 1e-9)).clip(0, 1))
 
 
 def _refine(values: Float32Array, guess: Circle) -> Circle | None:
