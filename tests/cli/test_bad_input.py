@@ -81,7 +81,11 @@ CASES = [
     ("mask all zero", 3, write("mask.png", np.zeros((24, 24), np.uint8))),
     ("empty folder", 3, remove_images),
     ("light with a word", 3, replace_line(3, "0.1 north 0.9")),
-    ("light below the horizon", 3, replace_line(3, "0.1 0.2 -0.9")),
+    (
+        "light below the horizon",
+        3,
+        lights(lambda lines: [*lines[:2], *["0.1 0.2 -0.9"] * 3, *lines[5:]]),
+    ),
     ("fewer lights than images", 3, lights(lambda lines: lines[:-1])),
     ("more lights than images", 3, lights(lambda lines: [*lines, "0 0 1"])),
     ("lights in one plane", 3, "--light-indices 0,1,2"),

@@ -128,6 +128,44 @@ def test_an_uncertain_outline(run):
     )
 
 
+def write_on_disc(folder, lights=LIGHTS):
+    """Write images of a brushed ball on a bright round table, whose edge is as clear as its own."""
+    y, x = np.indices((260, 280))
+    nx, ny = (x - 120) / 40, (140 - y) / 40
+    inside = nx**2 + ny**2 < 1
+    n = np.stack((nx, ny, np.sqrt(np.where(inside, 1 - nx**2 - ny**2, 0))), axis=-1)
+    table = np.where(np.hypot(x - 140, y - 130) < 110, 0.15, 0.03)
+    for number, half in enumerate(halfway(lights)):
+        picture = np.where(inside, 0.02 + 0.9 * (n @ half).clip(0) ** 80, table)
+        write_image(folder / f"{number}.png", to_uint16(picture * 65535))
+
+
+def test_an_outline_that_may_not_be_the_balls(run):
+    write_on_disc(Path("disc"))
+    run(
+        "calibrate disc",
+        code=3,
+        says=(
+            "disc: the circle in the images (centre 140, 130, radius 110 pixels) may not be the",
+            "(centre 120, 140, radius 40 pixels) is clear, too, and contains all highlights.",
+            "calibration/calibration.png shows it. Give the ball's circle with --circle X,Y,R,",
+        ),
+    )
+    assert [path.name for path in Path("calibration").iterdir()] == ["calibration.png"]
+    run("calibrate disc --circle 120,140,40 --overwrite", says="from --circle")
+    assert angles_deg(read_light_directions("calibration/light_directions.txt", 4)).max() < 1.5
+    write_balls(Path("still"), LIGHTS[[1, 1, 1, 2]])
+    run("calibrate still -o still", code=3, says="the highlight stays in its place in most images")
+
+
+def test_two_masks_of_a_ball_are_named(run):
+    write_balls(Path("ball"))
+    for name in ("ball.mask.pgm", "old_mask.png"):
+        cv2.imwrite(f"ball/{name}", normals()[1].astype(np.uint8) * 255)
+    says = "warning: ball: ball.mask.pgm, old_mask.png: none is used as the mask. Choose one with"
+    run("calibrate ball", says=(says, "from picture"))
+
+
 def test_refusals(refuse):
     write_balls(Path("ball"))
     write_balls(Path("short"), LIGHTS[:3])

@@ -229,7 +229,8 @@ def _find_stack(path: Path, *_: int) -> Stack | None:
         usual = variable.name.lower() in _PICTURES
         if axes is not None and (usual or variable.shape[2:] != (3,)):  # such as normals
             stacks.append((not usual, Stack((variable,), axes, None)))
-    for (_, shape), group in _numbered(found).items():
+    for key, group in _numbered(found).items():
+        shape = key[1]
         if min(shape[:2]) > 3 and (len(shape) == 2 or shape[2:] == (3,)):
             stacks.append((False, Stack(tuple(group), "HWC"[: len(shape)], None)))
     stacks = [each for each in stacks if each[1].count <= _MOST_PICTURES]
