@@ -58,7 +58,7 @@ def test_lights_are_estimated_if_there_is_no_light_file(unlit, run, document):
     assert Path("out/ball/found_mask.png").exists()
     info = document(f"info {unlit}")
     assert info["light_source"] == "estimated" and info["mask"] == "found in the images"
-    for options in ("--strict", "--light-frame x-left", "--refine-lights", "--light-distance 90"):
+    for options in ("--strict", "--light-frame x-left", "--refine-lights"):
         says = ("--lights estimate", "splinecli calibrate")
         run(f"infer {unlit} {options} -o other", code=3, says=says)
     run(f"infer {unlit} --lights none.txt -o other", code=3, says="none.txt")

@@ -131,13 +131,13 @@ def test_auto_mask(document, capture):
     assert (report["mask"], report["n_pixels"]) == ("found in the images", 24 * 16)
 
 
-def test_the_contact_sheet_is_that_of_infer(sphere, run, document):
+def test_the_contact_sheet_is_that_of_infer(capture, run, document):
     """A picture that is left out is on it, too."""
-    assert cv2.imwrite("sphere/photo_albedo.png", np.zeros((9, 9), np.uint8))
-    report = document("infer sphere --method ls --html")
+    assert cv2.imwrite(str(capture / "photo_albedo.png"), np.zeros((9, 9), np.uint8))
+    report = document(f"infer {capture} --method ls --html")
     assert "capture.png" in report["files"]
-    assert "The images as they are used" in Path("out/sphere/page.html").read_text()
-    run("info sphere -o seen")
-    seen = Path("seen/sphere/capture.png").read_bytes()
-    assert seen == Path("out/sphere/capture.png").read_bytes()
-    run("info sphere -o seen", code=5, says="--overwrite")
+    assert "The images as they are used" in Path(report["folder"], "page.html").read_text()
+    run(f"info {capture} -o seen")
+    seen = Path("seen", report["capture"], "capture.png").read_bytes()
+    assert seen == Path(report["folder"], "capture.png").read_bytes()
+    run(f"info {capture} -o seen", code=5, says="--overwrite")
