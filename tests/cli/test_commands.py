@@ -168,6 +168,10 @@ def test_a_line_every_half_minute_off_a_terminal(capsys, monkeypatch):
         now += 40
         advance(25_000)
     assert capsys.readouterr().err == "cat: refining: 25 %, 625 pixels/s, 120 s left\n"
+    with Messages(quiet=False).progress("cat: aligning", 100) as advance:
+        now += 40
+        advance(2)  # too early for an estimate of the time
+    assert capsys.readouterr().err == "cat: aligning: 2 %\n"
     with Messages(quiet=True).progress("cat: estimating", 1) as advance:
         now += 100
         advance(0.5)

@@ -46,6 +46,19 @@ def test_automatic_precision_agrees_with_the_kernel_s_list_of_instructions():
     assert choose_precision("auto", torch.device("cpu")) == ("bfloat16" if native else "float32")
 
 
+@pytest.mark.parametrize(
+    ("limit", "has_bfloat16"),
+    [("AVX2", False), ("AVX512_CORE", False), ("avx512_core_bf16", True), ("DEFAULT", True)],
+)
+def test_automatic_precision_respects_the_limit_of_onednn(limit, has_bfloat16, monkeypatch):
+    """Emulated, bfloat16 takes more than twice as long as float32."""
+    found = {"avx512_bf16": True}
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: found, raising=False)
+    monkeypatch.setenv("DNNL_MAX_CPU_ISA", limit)
+    expected = "bfloat16" if has_bfloat16 else "float32"
+    assert choose_precision("auto", torch.device("cpu")) == expected
+
+
 @pytest.fixture
 def mount(tmp_path, monkeypatch):
     """The folder of control groups, beside the file `groups` that says in which ones this process

@@ -120,6 +120,7 @@ def _unknown_name(error: Any) -> str | None:
     )
 
 
+_LEAST_DONE = 0.05  # share of the work below which the time that is left is unknown
 LINE_SECONDS = 30.0  # seconds between two progress lines if stderr is not a terminal
 
 
@@ -199,7 +200,8 @@ class Messages(Observer):
                 shown = now
                 speed = (done - start) / (now - began)
                 notes = [_in_words(speed, unit)] if unit else []
-                notes += [f"{(total - done) / speed:.0f} s left"] if speed else []
+                known = done - start >= _LEAST_DONE * (total - start)
+                notes += [f"{(total - done) / speed:.0f} s left"] if known else []
                 self.say(
                     ", ".join(
                         (f"{label}: {100 * done / total:.0f} %", *notes, *filter(None, [note]))
@@ -216,13 +218,20 @@ def _in_words(speed: float, unit: str) -> str:
 @contextmanager
 def _bar(label: str, total: float, start: float, unit: str) -> Iterator[Advance]:
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, Task, TextColumn, TimeRemainingColumn
+    from rich.text import Text
+
+    class TimeLeft(TimeRemainingColumn):
+        def render(self, task: Task) -> Text:
+            if task.completed - start < _LEAST_DONE * (total - start):
+                return Text("-:--:--", style="progress.remaining")
+            return super().render(task)
 
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         TextColumn("{task.percentage:3.0f}%"),
-        TimeRemainingColumn(),
+        TimeLeft(),
         TextColumn("{task.fields[speed]}", markup=False),
         TextColumn("{task.fields[note]}", markup=False),
     )

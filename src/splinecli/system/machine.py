@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 import os
+import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -219,9 +220,13 @@ def choose_device(name: Device | str) -> torch.device:
     return torch.device("cuda" if available and name != "cpu" else "cpu")
 
 
+_HAS_BFLOAT16 = re.compile("(?i)(|ALL|DEFAULT)$|AVX512_CORE_(BF16|FP16|AMX)|AVX10")
+
+
 def choose_precision(name: Precision, device: torch.device) -> NumberFormat:
-    """Return the number format of this name; "auto" is bfloat16 if the device supports it
-    natively.
+    """Return the number format of this name; "auto" is bfloat16 if the device supports it natively,
+    and the environment does not limit oneDNN, which computes the convolutions, to instructions
+    without it.
     """
     if name != "auto":
         return name
@@ -232,6 +237,8 @@ def choose_precision(name: Precision, device: torch.device) -> NumberFormat:
     else:  # a CPU without the instructions emulates bfloat16, which is slower than float32
         found = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
         native = bool(found.get("avx512_bf16") or found.get("amx_bf16") or found.get("bf16"))
+        limits = (os.environ.get(f"{name}_MAX_CPU_ISA", "ALL") for name in ("ONEDNN", "DNNL"))
+        native = native and all(map(_HAS_BFLOAT16.match, limits))
     return "bfloat16" if native else "float32"
 
 
