@@ -204,3 +204,12 @@ with Messages(quiet=False).progress("cat", 25) as advance:
     assert process.wait() == 0
     percentages = {part.split()[-1] for part in shown.decode().split("%")[:-1] if part.split()}
     assert len(percentages) >= 4
+
+
+def test_messages_name_what_was_meant(run, tmp_path):
+    run("infer none --maps albedos", code=2, says="such as albedo.")
+    run("infer none --maps reliefs", code=2, says="such as relief.")
+    result = run("watch nowhere", code=3, says="nowhere")
+    assert "waiting" not in result.err
+    (tmp_path / "a.txt").write_text("no normals")
+    run(f"integrate {tmp_path / 'a.txt'}", code=3, says="found neither .npy, .mat, PNG, TIFF,")
