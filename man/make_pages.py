@@ -61,7 +61,7 @@ FILES = {
     " depth.tiff, depth.png": "With --surface, or from splinecli integrate"
     " OUT/NAME, which also writes surface.json and, with --level, level_normals.npy and"
     " level_normals.png. Both can write mesh.obj (with mesh.mtl, mesh.png, mesh_roughness.png and"
-    " mesh_metalness.png) and mesh.stl.",
+    " mesh_metalness.png), mesh.stl and mesh.3mf.",
     "OUT/NAME/page.html": "With --html: all pictures, and the surface under a light that"
     " follows the pointer.",
     "OUT/NAME/report.json": "Lights, method, weights, options, time, warnings and errors.",

@@ -3,6 +3,8 @@
 import json
 from copy import deepcopy
 from pathlib import Path
+from xml.etree import ElementTree
+from zipfile import ZipFile
 
 import cv2
 import numpy as np
@@ -17,6 +19,7 @@ from splinecli.maths.normals import encode_picture
 from splinecli.pipeline.infer import results_bytes
 
 SHAPE = (40, 50)
+CORE_3MF = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
 
 
 def sphere():
@@ -260,6 +263,41 @@ def test_millimetres_in_the_files(run):
         extents = trimesh.load(Path("out", name)).extents * unit_mm
         assert extents[[0, 2]] == pytest.approx([width_mm, np.ptp(report["range"])], rel=1e-4), name
     assert b"\ncomment unit: millimetre\n" in Path("out/mesh.ply").read_bytes()
+
+
+def test_a_solid_in_the_files(run):
+    """The meshes of a cap are watertight, and have its volume in millimetres."""
+    import trimesh
+
+    run("integrate normals.npy -o out --pixel-size 0.5 --solid 3 --format glb,ply,obj,stl,3mf")
+    with ZipFile("out/mesh.3mf") as package:
+        model = ElementTree.fromstring(package.read("3D/3dmodel.model"))
+    assert model.attrib["unit"] == "millimeter"
+    vertices, faces = (
+        [list(row.attrib.values()) for row in model.iter(f"{{{CORE_3MF}}}{name}")]
+        for name in ("vertex", "triangle")
+    )
+    solids = [trimesh.Trimesh(np.array(vertices, float), np.array(faces, int), process=False)]
+    for name in ("mesh.stl", "mesh.ply", "mesh.obj", "mesh.glb"):
+        solids.append(trimesh.load(Path("out", name), force="mesh"))
+    solids[-1].apply_scale(1000)
+    _, heights, inside = sphere()
+    above = 0.5 * (heights - heights[inside].min()) + 3
+    squares = np.stack((above[:-1, :-1], above[1:, :-1], above[:-1, 1:], above[1:, 1:]))
+    area = {4: 0.25, 3: 0.125}  # in mm^2, of squares of four and three pixels
+    volume = sum(
+        area[len(corners)] * corners.mean()
+        for corners in (square[np.isfinite(square)] for square in squares.reshape(4, -1).T)
+        if len(corners) >= 3
+    )
+    for solid in solids:
+        assert solid.is_watertight
+        assert solid.volume == pytest.approx(volume, rel=0.01)
+    run(
+        "integrate normals.npy -o flat --solid 3",
+        code=2,
+        says=("the surface has no scale", "--pixel-size"),
+    )
 
 
 def test_a_picture_of_the_depth(run):

@@ -48,7 +48,7 @@ def integrate(options: IntegrateOptions) -> None:
     together. Without a camera matrix, the depth map has heights towards the camera in pixels, with
     mean zero. With one, it has depths along the viewing axis, of unknown scale.
 
-    Writes OUT/mesh.glb and mesh.ply (or .obj, .stl), depth.npy and depth.tiff, which are NaN
+    Writes OUT/mesh.glb and mesh.ply (or .obj, .stl, .3mf), depth.npy and depth.tiff, which are NaN
     outside the object, depth.png and surface.json.
     """
     from splinecli.pipeline.integrate import integrate_normal_map, summary_line

@@ -123,6 +123,7 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
         options.prior_detail,
         options.level,
         options.pixel_aspect,
+        options.solid,
     )
     picture, textures = _read_textures(options, mask.shape)
     with observer.progress("integrating", 1.0) as advance:

@@ -257,6 +257,13 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
         "N",
         "all",
     )
+    solid: Annotated[float, Meta(gt=0, le=1e4)] | None = option(
+        "Output",
+        "Close the mesh for printing: walls along its border, and a flat back so far behind its"
+        " lowest point.",
+        "MM",
+        "open",
+    )
     overwrite: shared.Overwrite = False
 
     def __post_init__(self) -> None:

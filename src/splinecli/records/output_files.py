@@ -39,6 +39,7 @@ SURFACE_FILES = {
     "ply": ("mesh.ply",),
     "obj": ("mesh.obj", "mesh.mtl", "mesh.png", "mesh_roughness.png", "mesh_metalness.png"),
     "stl": ("mesh.stl",),
+    "3mf": ("mesh.3mf",),
     "npy": ("depth.npy",),
     "tiff": ("depth.tiff",),
     "png": ("depth.png",),

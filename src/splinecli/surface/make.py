@@ -16,6 +16,7 @@ from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.integration import integrate_normals
 from splinecli.surface.levelling import level_heights, level_normals, plane_slopes
 from splinecli.surface.mesh import Textures, decimated_mesh, surface_mesh
+from splinecli.surface.solid import close_mesh
 from splinecli.surface.surface_files import Surface
 from splinecli.system.progress import Progress, ignore
 
@@ -31,6 +32,8 @@ class SurfaceSettings:
         is not needed.
     level: points or (), as in plane_slopes; None leaves the surface as it is.
     pixel_aspect: height of a pixel in widths.
+    solid_mm: the thickness of a closed mesh at its lowest point (close_mesh), for a surface in
+        millimetres. None leaves the mesh open.
     """
 
     discontinuity: float = DISCONTINUITY
@@ -41,9 +44,19 @@ class SurfaceSettings:
     prior_detail: float | None = None
     level: tuple[tuple[int, int], ...] | None = None
     pixel_aspect: float = 1.0
+    solid_mm: float | None = None
 
     def check(self, camera_matrix: Floats | None) -> None:
-        """Raise UsageError for settings that need an orthographic camera, if there is a matrix."""
+        """Raise UsageError for settings that need an orthographic camera, if there is a matrix.
+
+        A solid needs a surface in millimetres.
+        """
+        has_scale = self.prior is not None and camera_matrix is not None
+        if self.solid_mm is not None and self.pixel_size_mm is None and not has_scale:
+            raise UsageError(
+                f"--solid {self.solid_mm:g} is in millimetres, but the surface has no scale",
+                hint="Give the width of a pixel on the object with --pixel-size",
+            )
         option, hint = "--level", "Level the mesh in another program"
         if self.level is None:
             option, hint = "--pixel-aspect", "Its fx and fy describe the pixels"
@@ -102,6 +115,8 @@ def make_surface(
     elif settings.pixel_size_mm is not None:
         unit, millimetres, scale = "millimetre", 1.0, settings.pixel_size_mm / pixel
         depth, mesh = depth * scale, replace(mesh, vertices=mesh.vertices * np.float32(scale))
+    if settings.solid_mm is not None:
+        mesh = close_mesh(mesh, settings.solid_mm, perspective=camera_matrix is not None)
     # the digits of float32
     low, high = (float(f"{end(depth):.7g}") for end in (np.nanmin, np.nanmax))
     report = SurfaceFacts(

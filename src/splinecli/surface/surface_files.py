@@ -1,4 +1,4 @@
-"""The files of a surface: meshes (glTF, PLY, OBJ, STL) and depth maps (NPY, TIFF, EXR, PNG).
+"""The files of a surface: meshes (glTF, PLY, OBJ, STL, 3MF) and depth maps (NPY, TIFF, EXR, PNG).
 
 The command line needs the names in this file, so everything heavier than NumPy is imported in
 functions.
@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
+from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 import numpy as np
 
 from splinecli.errors import OutputError
-from splinecli.maths import Float32Array, Floats, Picture
+from splinecli.maths import Float32Array, Floats, Integers, Picture
 from splinecli.maths.transfer import decode_transfer, encode_srgb
 from splinecli.records.output_files import SURFACE_FILES
 from splinecli.system.machine import import_extra
@@ -204,6 +205,52 @@ def _encode_obj(surface: Surface) -> dict[str, bytes]:
     return {"mesh.obj": text.encode(), **files}
 
 
+_XML = '<?xml version="1.0" encoding="UTF-8"?>\n'
+_PACKAGE = {
+    "[Content_Types].xml": """<Types
+xmlns="http://schemas.openxmlformats.org/package/2006/content-types">
+<Default Extension="rels" ContentType="application/vnd.openxmlformats-package.relationships+xml"/>
+<Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/>
+</Types>""",
+    "_rels/.rels": """<Relationships
+xmlns="http://schemas.openxmlformats.org/package/2006/relationships">
+<Relationship Id="model" Target="/3D/3dmodel.model"
+Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/>
+</Relationships>""",
+    "3D/3dmodel.model": """<model unit="millimeter" xml:lang="en"
+xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">
+<resources><object id="1" type="model"><mesh>
+<vertices>
+{vertices}</vertices>
+<triangles>
+{triangles}</triangles>
+</mesh></object></resources>
+<build><item objectid="1"/></build>
+</model>""",
+}
+
+
+def _encode_3mf(surface: Surface) -> bytes:
+    """Encode 3MF (3D Manufacturing Format, core specification 1.3) in millimetres."""
+    lines = {
+        "vertices": _lines(
+            '<vertex x="%.7g" y="%.7g" z="%.7g"/>\n', surface.mesh.vertices * surface.millimetres
+        ),
+        "triangles": _lines('<triangle v1="%d" v2="%d" v3="%d"/>\n', surface.mesh.triangles),
+    }
+    file = io.BytesIO()
+    with ZipFile(file, "w") as package:
+        for name, text in _PACKAGE.items():
+            package.writestr(ZipInfo(name), _XML + text.format(**lines), ZIP_DEFLATED)
+    return file.getvalue()
+
+
+def _lines(line: str, rows: Floats | Integers) -> str:
+    """Return the text of all rows (N, 3), with few numbers as objects at once."""
+    parts = np.array_split(rows, len(rows) // 100_000 + 1)
+    return "".join(line * len(part) % tuple(part.ravel().tolist()) for part in parts)
+
+
 def encode_tiff(values: Float32Array, description: str) -> bytes:
     """Return the TIFF file of a map (H, W) or (H, W, C)."""
     import tifffile
@@ -243,6 +290,7 @@ _ENCODERS: dict[str, Callable[[Surface], Content]] = {
     "ply": _encode_ply,
     # binary, with positions alone
     "stl": lambda surface: _trimesh(surface.mesh).export(file_type="stl"),
+    "3mf": _encode_3mf,
     "npy": lambda surface: surface.depth.astype("f4"),
     "tiff": lambda surface: encode_tiff(surface.depth.astype("f4"), f"unit: {surface.unit}"),
     "png": _encode_png,
