@@ -2,6 +2,7 @@
 
 import re
 
+import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -11,7 +12,6 @@ from scipy.ndimage import gaussian_filter, label
 from splinecli.errors import InputError, UsageError
 from splinecli.maths.normals import unit
 from splinecli.surface import integration
-from splinecli.surface.bilateral_equations import CONTRADICTION
 from splinecli.surface.integration import integrate_normals, relief_of_normals
 
 Mask = NDArray[np.bool_]
@@ -23,6 +23,7 @@ COARSE_FROM = {"own scale": 10**9, "coarse to fine": 300}
 @pytest.fixture
 def no_movement(monkeypatch):
     monkeypatch.setattr(integration, "STILL", 0.0)
+    monkeypatch.setattr(integration, "LEAST_FORCE", 1e-9)
     monkeypatch.setattr(integration, "SOLVES_OF_COARSEST", 400)
 
 
@@ -217,13 +218,7 @@ def dense(normals, mask, discontinuity, iterations):
         weights = []
         for forth, back in ((0, 1), (1, 0), (2, 3), (3, 2)):
             gaps = (matrices[back] @ heights) ** 2 - (matrices[forth] @ heights) ** 2
-            residuals = [
-                np.abs(matrices[side] @ heights + constants[side]) for side in (forth, back)
-            ]
-            share = 1 / (1 + np.exp(-discontinuity * (iteration > 0) * gaps)) - 0.5
-            weights.append(
-                0.5 + share * (1 - np.exp(-((np.maximum(*residuals) / CONTRADICTION) ** 2)))
-            )
+            weights.append(1 / (1 + np.exp(-discontinuity * (iteration > 0) * gaps)))
         root = np.sqrt(np.concatenate(weights))
         heights = np.linalg.lstsq(
             root[:, None] * np.concatenate(matrices), -root * np.concatenate(constants)
@@ -403,22 +398,21 @@ def test_bad_input(arguments, options, error, message):
         integrate_normals(*arguments, **options)
 
 
-def test_errors_of_the_normals_tear_less_than_with_the_published_weights():
-    """Steep waves whose normals have smooth errors of 8 degrees. The published weights tear 1.4 %
-    of the pairs.
-    """
-    x, y = grid(160, 160)
-    truth = 20 * np.sin(x / 8) * np.cos(y / 12)
-    normals = normals_of_slopes(
-        2.5 * np.cos(x / 8) * np.cos(y / 12), -20 / 12 * np.sin(x / 8) * np.sin(y / 12)
-    )
-    errors = gaussian_filter(np.random.default_rng(2).normal(size=normals.shape), (2, 2, 0))
-    noisy = unit(normals + np.radians(8) * errors / errors.std())
-    torn = {}
-    for discontinuity in (0.0, 2.0):
-        found = integrate_normals(noisy, np.ones(x.shape, bool), discontinuity=discontinuity)
-        torn[discontinuity] = float((np.abs(np.diff(found - truth, axis=1)) > 1.5).mean())
-    assert torn[0] < torn[2] < 0.0125
+@pytest.mark.parametrize(
+    "name, published_mm", [("bear", 0.334), ("cat", 0.074), ("reading", 0.257)]
+)
+def test_measured_objects_are_as_exact_as_published(shared_data, name, published_mm):
+    """Exact solves would let the heads and paws of these drift: 0.45, 0.10 and 0.28 mm."""
+    folder = shared_data / "depth" / name
+    mask = cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE) > 0
+    colours = cv2.imread(str(folder / "normal_map.png"), cv2.IMREAD_UNCHANGED)
+    normals = unit(colours[..., ::-1] / 65535 * 2 - 1)
+    with np.load(folder / "depth_gt.npz") as file:
+        truth = next(iter(file.values()))[mask]
+    depth = integrate_normals(normals, mask, np.loadtxt(folder / "K.txt"))[mask]
+    known = truth > 0
+    depth, truth = depth[known], truth[known]
+    assert np.abs(depth * np.median(truth / depth) - truth).mean() < 1.1 * published_mm
 
 
 @pytest.mark.parametrize(

@@ -16,19 +16,12 @@ by
     share = sigmoid(discontinuity * facing^2 * (gap towards the other side^2 - gap towards this
     side^2)).
 
-A side without a neighbour is treated as a gap of zero. In the paper, noise and small errors of the
-normals change the shares, too, so that a continuous surface tears along rows and columns of pixels.
-Here a share deviates from 1/2 only to the extent that the surface contradicts the normal, with r
-the larger residual of the two sides:
-
-    1/2 + (share - 1/2) (1 - exp(-(r / CONTRADICTION)^2)).
+A side without a neighbour is treated as a gap of zero.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import count
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,8 +32,7 @@ from splinecli.maths.pixel_grid import focal_length, pixel_rays, ray_basis
 
 PixelNumbers = NDArray[np.int32]
 DISCONTINUITY = 2.0  # how easily the surface tears, as in the paper
-# residual that contradicts a normal, such as a frontal one with an error of 17 degrees
-CONTRADICTION = 0.3
+_MOST_STEPS = 5_000  # of conjugate gradients, as in the paper's code
 
 # The cosine between a normal and its ray at 87 degrees. Beyond it, a degree changes the slope by a
 # third or more, so the normal says nothing reliable about the height. The equations of the
@@ -97,14 +89,11 @@ class BilateralEquations:
         weights, flows = [], []
         for slant, (near, far) in zip(self.slants, self.pairs, strict=True):
             gap = heights[far] - heights[near]
-            ahead, behind, largest = np.zeros((3, len(heights)))
+            ahead, behind = np.zeros((2, len(heights)))
             ahead[near], behind[far] = gap, gap
             # Both pixels of a pair have an equation for its gap.
             residuals = [self.facing[pixels] * gap + slant[pixels] for pixels in (near, far)]
-            for pixels, residual in zip((near, far), residuals, strict=True):
-                largest[pixels] = np.maximum(largest[pixels], np.abs(residual))
             share_ahead = expit(discontinuity * self.facing**2 * (behind**2 - ahead**2))
-            share_ahead = 0.5 - (share_ahead - 0.5) * np.expm1(-((largest / CONTRADICTION) ** 2))
             weight, flow = np.zeros((2, len(gap)))
             shares = share_ahead[near], 1 - share_ahead[far]
             for pixels, share, residual in zip((near, far), shares, residuals, strict=True):
@@ -118,9 +107,7 @@ class BilateralEquations:
 class LaplacianSolver:
     """Solve the normal equations of pairs of neighbours repeatedly, with changing weights.
 
-    The matrix is a weighted Laplacian of the graph of pixels. The solver has conjugate gradients
-    with an algebraic multigrid preconditioner. Its setup costs as much as several solves, so it is
-    kept while the weights stay similar.
+    The matrix is a weighted Laplacian of the graph of pixels.
     """
 
     def __init__(self, pairs: tuple[tuple[PixelNumbers, PixelNumbers], ...], n_pixels: int) -> None:
@@ -129,7 +116,6 @@ class LaplacianSolver:
         self._near = np.concatenate([near for near, _ in pairs])
         self._far = np.concatenate([far for _, far in pairs])
         self._n_pixels = n_pixels
-        self._preconditioner: Any = None
         # The matrix always has the same pattern. A matrix of positions records the place of each
         # value.
         pixels = np.arange(n_pixels, dtype=np.int32)
@@ -138,51 +124,49 @@ class LaplacianSolver:
         positions = np.arange(len(rows), dtype=np.int32)
         self._pattern = csr_matrix((positions, (rows, columns)), shape=(n_pixels, n_pixels))
 
+    def forces(self, flows: Float64Array) -> Float64Array:
+        """Return the forces on the heights (P,): half the negative derivative of the cost."""
+        return self._sum(flows, self._near) - self._sum(flows, self._far)
+
     def solve(
         self,
         weights: Float64Array,
-        flows: Float64Array,
+        forces: Float64Array,
         *,
-        precision: float,
         pull: Float64Array | float = 0.0,
-        distance: Float64Array | float = 0.0,
+        least: float = 0.0,
     ) -> Float64Array:
         """Return the change of heights (P,) that minimises the sum of squares.
 
-        The solution is accurate to a relative residual of `precision`. Weights (E,) are half the
-        second derivative by the gap of each pair, flows (E,) half the first. `pull` (P,) is half
-        the second derivative by the height of each pixel, of the cost that pulls it to a known
-        height, and `distance` (P,) has the heights above these known ones.
+        Weights (E,) are half the second derivative by the gap of each pair, and `forces` (P,) half
+        the negative first derivative by each height. `pull` (P,) is half the second derivative of
+        the cost that pulls each height to a known one; `forces` include its pull. The norm of the
+        forces that are left is at most `least`. With 0, the solution is exact to seven digits.
         """
-        from pyamg import ruge_stuben_solver
-        from scipy.sparse import csr_matrix
+        from scipy.sparse import csr_matrix, diags_array
         from scipy.sparse.linalg import cg
 
         # Small costs on the change of gaps and of heights in one solve; the equations have costs up
         # to 1. Pixels that no equation ties to others keep their heights, and the system is never
         # singular.
-        weights = weights + 1e-7
+        weights = weights + 1e-10
         diagonal = self._sum(weights, self._near) + self._sum(weights, self._far) + 1e-12 + pull
         values = np.concatenate((-weights, -weights, diagonal))[self._pattern.data]
         matrix = csr_matrix(
             (values, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape
         )
-        if self._preconditioner is None:
-            # On these matrices, classical multigrid is faster than smoothed aggregation, both to
-            # set up and to use.
-            self._preconditioner = ruge_stuben_solver(matrix).aspreconditioner()
-        steps = count()
         change: Float64Array
-        change, _ = cg(
-            matrix,
-            self._sum(flows, self._near) - self._sum(flows, self._far) - pull * distance,
-            rtol=precision,
-            maxiter=200,
-            M=self._preconditioner,
-            callback=lambda _: next(steps),
-        )
-        if next(steps) > 15:  # then a new preconditioner saves more time than it costs
-            self._preconditioner = None
+        if least > 0:
+            # not multigrid, which would move whole parts even if their forces are that small
+            inverse = diags_array(1 / np.maximum(diagonal, 1e-5))
+            change, _ = cg(matrix, forces, rtol=0, atol=least, maxiter=_MOST_STEPS, M=inverse)
+            return change
+        from pyamg import ruge_stuben_solver
+
+        # On these matrices, classical multigrid is faster than smoothed aggregation, both to set up
+        # and to use.
+        multigrid = ruge_stuben_solver(matrix).aspreconditioner()
+        change, _ = cg(matrix, forces, rtol=1e-7, maxiter=200, M=multigrid)
         return change
 
     def _sum(self, of_pairs: Float64Array, pixels: PixelNumbers) -> Float64Array:

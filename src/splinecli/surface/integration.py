@@ -1,11 +1,10 @@
 """Bilateral normal integration: heights from normals, with discontinuities at the edges of objects.
 
-Cao, Santo, Shi, Okura and Matsushita, Bilateral normal integration, ECCV 2022, with two changes:
-the surface tears only where it contradicts the normals, and large maps are integrated from coarse
-to fine. A coarse surface from another source may give the shape at wavelengths above some pixels
-(Nehab, Rusinkiewicz, Davis and Ramamoorthi, Efficiently combining positions and normals for precise
-3D geometry, SIGGRAPH 2005). `bilateral_equations` has the equations and the linear solver. Frame: x
-right, y up, z to the camera (docs/files-and-frames.md).
+Cao, Santo, Shi, Okura and Matsushita, Bilateral normal integration, ECCV 2022. Large maps are
+integrated from coarse to fine. A coarse surface from another source may give the shape at
+wavelengths above some pixels (Nehab, Rusinkiewicz, Davis and Ramamoorthi, Efficiently combining
+positions and normals for precise 3D geometry, SIGGRAPH 2005). `bilateral_equations` has the
+equations and the linear solver. Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 """
 
 from __future__ import annotations
@@ -27,9 +26,11 @@ from splinecli.surface.bilateral_equations import (
 )
 from splinecli.system.progress import Progress, ignore
 
-_LATER_PRECISION = 0.03  # relative residual of the linear solves but the first
-STILL = 0.002  # pixels: the rms movement at which the surface is finished
-COARSEST = 8_000  # pixels; larger maps start from blocks of 2 x 2 pixels
+STILL = 0.01  # pixels: the rms movement at which the surface is finished
+# Forces on the heights below this share of those on a flat surface move nothing (the tolerance of
+# the paper's code). Of a part that is torn off all around, they are no more than this.
+LEAST_FORCE = 1e-3
+COARSEST = 64_000  # pixels; larger maps start from blocks of 2 x 2 pixels
 SOLVES_OF_COARSEST = 150
 # of a prior in pixels or millimetres; above it, float32 only represents whole numbers
 _LARGEST_VALUE = 1e7
@@ -96,7 +97,8 @@ def integrate_normals(
     surface = _Surface(normal_map, mask, camera_matrix, known, prior_detail or 0.0)
     if known is not None:
         _check_prior(surface)
-    return _depth_map(_integrate(surface, discontinuity, progress), mask, camera_matrix, known)
+    heights = _integrate(surface, discontinuity, STILL, progress)
+    return _depth_map(heights, mask, camera_matrix, known)
 
 
 def relief_of_normals(normal_map: Float32Array, mask: Bools) -> Float32Array:
@@ -138,8 +140,12 @@ class _Surface(NamedTuple):
         return _Surface(normals, blocks.mask, camera, prior, self.prior_detail / blocks.step)
 
 
-def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> Float64Array:
+def _integrate(
+    surface: _Surface, discontinuity: float, still: float, progress: Progress
+) -> Float64Array:
     """Return the heights (P,) of the mask's pixels, with the method of integrate_normals.
+
+    They are finished when they move by less than `still`, the rms in pixels.
 
     A large map starts from the heights of blocks of 2 x 2 pixels: where the surface tears, and by
     how much, is found at the coarsest scale, where many solves take little time. Finer scales
@@ -149,36 +155,37 @@ def _integrate(surface: _Surface, discontinuity: float, progress: Progress) -> F
     equations = BilateralEquations.from_normals(normal_map, mask, camera_matrix)
     n_pixels = len(equations.facing)
     heights = np.zeros(n_pixels)
-    # At heights of zero all weights are equal, so the first solve is least squares and needs full
-    # precision. Each later solve moves the surface a little further, for which few digits suffice.
-    precision, most, own_share = 1e-9, SOLVES_OF_COARSEST if discontinuity > 0 else 1, 1.0
+    most, own_share = SOLVES_OF_COARSEST if discontinuity > 0 else 1, 1.0
     is_huge = n_pixels > 8_000_000  # larger maps have the heights of their blocks, interpolated
     if is_huge or (n_pixels > COARSEST and discontinuity > 0):
         blocks = Blocks.of_step(mask, 2)
         coarse = surface.of_blocks(blocks, keep_edges=not is_huge)
         of_blocks, own_share = np.zeros(blocks.mask.shape), 0.75
         of_blocks[blocks.mask] = _integrate(
-            coarse, discontinuity, lambda share: progress((1 - own_share) * share)
+            coarse, discontinuity, still / 2, lambda share: progress((1 - own_share) * share)
         )
         heights = blocks.step * np.asarray(blocks.interpolate(of_blocks, mask), np.float64)
         if is_huge:
             return heights
-        precision, most = _LATER_PRECISION, min(20, max(4, 1_000_000 // n_pixels))
+        most = min(20, max(4, 1_000_000 // n_pixels))
     solver = LaplacianSolver(equations.pairs, n_pixels)
     # Normals determine gaps, which are smaller at longer wavelengths. At this one, both have the
     # same weight.
     pull = 0.0 if prior is None else (2 * np.pi / prior_detail) ** 2 * np.isfinite(prior)
     known_heights = 0.0 if prior is None else np.nan_to_num(prior)
-    for _ in range(most):
+    # At heights of zero, all weights are equal, so the first solve is least squares. If the surface
+    # then tears around a part, hardly any force holds it, and exact solves would let it drift by
+    # several pixels. Small forces therefore move nothing.
+    of_flat = solver.forces(equations.weigh(np.zeros(n_pixels), 0.0)[1]) + pull * known_heights
+    least = LEAST_FORCE * float(np.linalg.norm(of_flat))
+    for number in range(most):
         weights, flows = equations.weigh(heights, discontinuity)
-        change = solver.solve(
-            weights, flows, precision=precision, pull=pull, distance=heights - known_heights
-        )
+        forces = solver.forces(flows) - pull * (heights - known_heights)
+        change = solver.solve(weights, forces, pull=pull, least=least if number else 0.0)
         heights += change
         progress(own_share / most)
-        if precision == _LATER_PRECISION and np.std(change) < STILL:
+        if number and np.std(change) < still:
             break
-        precision = _LATER_PRECISION
     return heights
 
 
