@@ -2,8 +2,8 @@
 
     python benchmarks/all_figures.py DATA [--results runs/figures] [--only NAME ...] [--again]
 
-DATA has the folders DiLiGenT/pmsData, synth/L17, statues, uw, psbox and merl_nbrdf. Everything
-together takes hours on two cores. Each row is stored in docs/figures.json when it is done, with the
+DATA has the folders DiLiGenT/pmsData, depth, synth/L17, statues, uw, psbox and merl_nbrdf. All of
+it takes hours on two cores. Each row is stored in docs/figures.json when it is done, with the
 version and the weights. Rows of the shipped weights, and of fits, which earlier versions may have
 measured, are not measured again. A stopped evaluation goes on in --results. --only names
 measurements, or a row of one, as in noise/iw12. "speed" and "sizes" run only if they are named,
@@ -164,6 +164,20 @@ class Bench:
         )
         [found] = evaluate_captures(options).document["relighting"]
         return {kind: found[kind]["psnr_db"] for kind in tables.PICTURES.values()}
+
+    def depths(self, label: str) -> Cells:
+        import surfaces
+
+        errors = surfaces.measured_depths(self.data, label, 2)
+        return {name: round(error, 4) for name, error in errors.items()}
+
+    def flat_things(self) -> dict[str, Cells]:
+        import surfaces
+
+        rows = surfaces.flat_things("spline-net", 64)
+        return {
+            scene: {name: round(error, 4) for name, error in cells.items()} for scene, cells in rows
+        }
 
     def slants(self, label: str) -> Cells:
         """Mean errors of the pixels of each range of true slants, under ten lights."""
@@ -354,6 +368,8 @@ class Bench:
             "photographs": {name: partial(self.photographs, name) for name in captures},
             "confidence": {name: partial(self.confidence, name) for name in captures},
             "refined-lights": {m: partial(self.refined_lights, m) for m in ("iw12", *NETWORKS)},
+            "depths": {label: partial(self.depths, label) for label in tables.DEPTHS},
+            "flat-things": each(self.flat_things, tables.FLAT_THINGS),
             "relighting": {label: partial(self.relighting, label) for label in OBJECTS},
             "distilled": {label: partial(self.distilled, label) for label in OBJECTS},
             "wrong-lights": each(self.wrong_lights, tables.WRONG_FILES),

@@ -45,6 +45,12 @@ PUBLISHED = "published"
 SCENES = [
     f"{look} {shape}" for shape in ("sphere", "relief", "plane") for look in ("matte", "glossy")
 ]
+DEPTHS = ("Bear", "Cat", "Reading")
+FLAT_THINGS = [
+    f"{shape}, {lights}"
+    for shape in ("plate", "coin", "inscription")
+    for lights in ("ring", "dome", "handheld")
+]
 LIGHTS = (4, 10, 20, 96)
 NOISE_DEG = (2.0, 4.0, 8.0)
 MIRROR_BALLS = ("University of Washington", "PSBox, mean of two", "examples/mirror_ball")
@@ -223,6 +229,26 @@ TABLES = {
     ),
     "calibration": Table(
         ("calibration",), "ball", same(MIRROR_BALLS), same(("mean", "largest")), "{:.1f}"
+    ),
+    "depths": Table(
+        ("depths",),
+        "object",
+        same(DEPTHS),
+        {"true normals": "true normals", **code(("ls", *NETWORKS))},
+    ),
+    "flat-things": Table(
+        ("flat-things",),
+        "object, lights",
+        same(FLAT_THINGS),
+        {
+            "distant": "distant",
+            "unequal": "unequal",
+            "unequal, levelled": "unequal, levelled",
+            "near": "near",
+            "near, levelled": "near, levelled",
+            "near, positions given": "near, given",
+        },
+        "{:.0f} %",
     ),
     "relighting": Table(("relighting",), "object", same(OBJECTS), PICTURES, "{:.1f}"),
     "distilled": Table(("distilled",), "object", same(OBJECTS), same(("network", "distilled"))),

@@ -53,6 +53,29 @@ def light_directions() -> NDArray[np.float64]:
     )
 
 
+def _edge(inside: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a step from 0 to 1 over a distance of 0.06, the width of a slope."""
+    return np.clip(inside / 0.06 + 0.5, 0, 1)
+
+
+FLAT = {
+    "plate": lambda x, y: 0.04 * _edge(np.maximum(abs(x), abs(y)) - 0.85),
+    "coin": lambda x, y: (
+        0.05 * _edge(np.hypot(x, y) - 0.8)
+        + 0.05 * np.sqrt(np.maximum(0, 1 - (x / 0.35) ** 2 - ((y - 0.05) / 0.45) ** 2))
+        + 0.02 * _edge(0.06 - abs(np.hypot(x, y) - 0.65)) * (np.cos(24 * np.arctan2(y, x)) > 0)
+    ),
+    # rows of letters made of strokes
+    "inscription": lambda x, y: (
+        -0.04
+        * _edge(0.05 - abs(np.abs((4 * x + 0.5) % 1 - 0.5) / 4 - 0.06))
+        * _edge(0.11 - abs((2.5 * y + 0.5) % 1 - 0.5) / 2.5)
+        * (np.hypot(x, y) < 2)
+    ),
+}
+"""Heights of flat things over the camera's square: a rim, a head with a rim and marks, strokes."""
+
+
 def height_field(name: str, count: int = 401) -> Mesh:
     """Return a mesh over the camera's square, with exact normals; the sphere's edge falls off to a
     plane far below.
@@ -67,6 +90,9 @@ def height_field(name: str, count: int = 401) -> Mesh:
             0.6 * np.cos(5 * x) * np.cos(4 * y),
             -0.48 * np.sin(5 * x) * np.sin(4 * y),
         )
+    if name in FLAT:
+        heights = FLAT[name](x, y)
+        slope_y, slope_x = np.gradient(heights, place[1] - place[0])
     normals = np.stack((-slope_x, -slope_y, zero + 1), axis=-1).reshape(-1, 3)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     corner = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).ravel()
@@ -116,10 +142,18 @@ def material(*, glossy: bool) -> PrincipledMaterial:
 
 
 class Bench:
-    """One shape of one material, rendered under any lamps."""
+    """One shape of one material, rendered under lamps in these directions (F, 3)."""
 
-    def __init__(self, name: str, size: int, *, glossy: bool) -> None:
+    def __init__(
+        self,
+        name: str,
+        size: int,
+        *,
+        glossy: bool,
+        directions: NDArray[np.float64] | None = None,
+    ) -> None:
         self.name = name
+        self._directions = light_directions() if directions is None else directions
         mesh = sphere() if name == "sphere" else height_field(name)
         self._tracer = Tracer(mesh)
         self._visible: VisibleSurface = find_visible_surface(self._tracer, size, SAMPLES)
@@ -132,8 +166,17 @@ class Bench:
         self._truth = np.zeros((*mask.shape, 3), np.float32)
         self._truth[mask] = self._visible.normals
 
+    @property
+    def heights(self) -> NDArray[np.float64]:
+        """The mean heights (H, W) of the pixels, in pixels."""
+        mask, samples = self._visible.mask, self._visible.samples.position[:, 2]
+        heights = np.full(mask.shape, np.nan)
+        pixels = samples.reshape(-1, self._visible.samples_per_pixel).mean(axis=1)
+        heights[mask] = pixels * len(mask) / 2
+        return heights
+
     def under_distant_lights(self) -> Capture:
-        lights = light_directions().astype(np.float32)
+        lights = self._directions.astype(np.float32)
         images = render_direct(self._tracer, self._visible, lights, self._materials, self._patches)[
             "one"
         ]
@@ -143,7 +186,7 @@ class Bench:
         """Return the capture with lamps at a distance. It says that they are at `off` times that;
         None is distant.
         """
-        positions = light_directions() * distance
+        positions = self._directions * distance
         images = render_point_lights(
             self._tracer, self._visible, positions + self._mean, self._materials, self._patches
         )["one"]
@@ -157,7 +200,7 @@ class Bench:
         return replace(capture, lamps=lamps)
 
     def _capture(self, images: torch.Tensor) -> Capture:
-        directions = light_directions()
+        directions = self._directions
         return Capture(
             self.name,
             images.numpy(),
