@@ -107,9 +107,9 @@ def lights(setup: str) -> NDArray[np.float64]:
     else:  # on one side more than on the other, as by hand
         rng = np.random.default_rng(4)
         azimuth, zenith = rng.normal(60, 100, 16), rng.uniform(15, 65, 16)
-    azimuth, zenith = np.radians(azimuth), np.radians(zenith)
+    around, tilt = np.radians(azimuth), np.radians(zenith)
     return np.stack(
-        (np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)), axis=1
+        (np.sin(tilt) * np.cos(around), np.sin(tilt) * np.sin(around), np.cos(tilt)), axis=1
     )
 
 

@@ -129,6 +129,18 @@ def test_near_lamps(run):
     assert distant < 1 > distant_range
 
 
+def test_surfaces_of_flat_things(run):
+    """Tilts by unknown intensities are levelled; bends by near lamps need the positions."""
+    pytest.importorskip("embreex", reason="needs the extra 'render'")
+    rows = run("surfaces --flat --size 24 --method ls").splitlines()
+    assert len(rows) == 9
+    for row in rows:
+        distant, unequal, levelled, _, near, near_levelled, _, given = numbers(row)
+        assert distant < 30 > levelled < unequal
+        assert near > 60 < near_levelled
+        assert given < 30
+
+
 def test_inspection(run):
     printed = run("inspection --size 96 --plates 1 --depths 0.5 --method ls").splitlines()
     assert printed[2:] == [

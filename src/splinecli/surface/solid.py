@@ -30,8 +30,8 @@ def close_mesh(mesh: SurfaceMesh, thickness: float, *, perspective: bool) -> Sur
     triangles = _manifold(mesh.triangles)
     if not len(triangles):
         raise no_triangles(instead="leave --solid out")
-    used, triangles = np.unique(triangles, return_inverse=True)
-    triangles = triangles.reshape(-1, 3).astype(np.int32)
+    used, numbers = np.unique(triangles, return_inverse=True)
+    triangles = numbers.reshape(-1, 3).astype(np.int32)
     front = mesh.vertices[used]
     plane = front[:, 2].min() - np.float32(thickness)
     back = front * (plane / front[:, 2:]) if perspective else front.copy()
@@ -41,7 +41,7 @@ def close_mesh(mesh: SurfaceMesh, thickness: float, *, perspective: bool) -> Sur
     walls = ((second, first, first + n_front), (second, first + n_front, second + n_front))
     closed = np.concatenate((triangles, behind[:, ::-1], *(np.stack(w, axis=1) for w in walls)))
     normals = mesh.normals[used]
-    away = np.broadcast_to(np.float32((0, 0, -1)), normals.shape)
+    away = np.broadcast_to(np.array((0, 0, -1), np.float32), normals.shape)
 
     def twice(values: NDArray[Any]) -> NDArray[Any]:
         return np.concatenate((values[used], values[used]))
