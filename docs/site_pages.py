@@ -7,7 +7,6 @@ the site's layout.
 
 import posixpath
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -64,10 +63,8 @@ def command_pages() -> dict[str, str]:
     """Return name -> Markdown of each command, from its options, as for the man pages."""
     import typer
 
+    from splinecli.cli.help import examples_of, help_panels
     from splinecli.cli.main import app
-
-    sys.path.insert(0, str(ROOT / "man"))
-    from make_pages import EXAMPLES, help_panels
 
     group: Any = typer.main.get_command(app)
     context = group.context_class(group, info_name="splinecli", **group.context_settings)
@@ -82,9 +79,8 @@ def command_pages() -> dict[str, str]:
             own.command_path + " " + " ".join(command.collect_usage_pieces(own)),
         ]
         lines += ["```", "", plain(command.help), ""]
-        examples = [(line, words) for line, words in EXAMPLES.items() if line.split()[1] == name]
-        lines += ["## Examples", ""] if examples else []
-        for line, words in examples:
+        lines += ["## Examples", ""]
+        for line, words in examples_of(name).items():
             lines += [plain(words), "", "```sh", line, "```", ""]
         for title, rows in help_panels(command, own).items():
             lines += [f"## {title}", "", "| option | meaning |", "|---|---|"]

@@ -5,8 +5,6 @@ docs/generate.py runs this with the other generators.
 import inspect
 import json
 import re
-import shlex
-import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ from typing import Any
 import typer
 
 from splinecli import __version__
+from splinecli.cli.help import EXAMPLES, examples_of, help_panels, wrap_example
 from splinecli.cli.main import app
 from splinecli.records.documents import json_schema
 from splinecli.records.output_files import MAPS
@@ -56,7 +55,7 @@ FILES = {
         f"OUT/NAME/{', '.join(each.files.values())}": f"With --maps {each.name}: {each.content}."
         for each in MAPS.values()
     },
-    "OUT/frames/NAME": "The frames of a film, a capture of its own.",
+    "OUT/frames/NAME": "The frames of a video, a capture of its own.",
     "OUT/NAME/mesh.glb, mesh.ply, depth.npy,"
     " depth.tiff, depth.png": "With --surface, or from splinecli integrate"
     " OUT/NAME, which also writes surface.json and, with --level, level_normals.npy and"
@@ -73,61 +72,6 @@ ENVIRONMENT = {
     "OMP_NUM_THREADS": "Number of processor threads of the networks.",
     "CUDA_VISIBLE_DEVICES": "GPUs that --device auto and cuda may use.",
 }
-EXAMPLES = {
-    "splinecli infer obj/ --lights"
-    " l.txt": "Estimate the normals of one object from all its images.",
-    "splinecli infer catPNG --n-lights 10 --seed 0 --json": "Use ten lights and print the report.",
-    "splinecli infer captures/* -o results --overwrite": "Process a folder of captures.",
-    "splinecli infer obj/ --auto-mask --maps albedo,preview"
-    " --surface --html": "Also write albedo, preview, mesh and page.",
-    "splinecli watch parts/ -- --lights l.txt --jsonl": "Compute each part that arrives.",
-    "splinecli info obj/": "Describe the capture as infer would read it.",
-    "splinecli info obj/ --transfer srgb"
-    " --plot lights.png": "Check sRGB images, and plot the light directions.",
-    "splinecli calibrate chrome/ -o lights": "Measure light directions with a mirror ball.",
-    "splinecli calibrate chrome/ --circle 512,384,200"
-    " --gray-ball gray/ -o lights": "Give the outline of the ball, and"
-    " also measure light intensities.",
-    "splinecli integrate results/cat": "Make depth and a mesh from the results of infer.",
-    "splinecli integrate normals.png --mask mask.png"
-    " --format obj -o surface": "Make a mesh from any normal map.",
-    "splinecli evaluate pmsData --method ls --method spline-net"
-    " --n-lights 10 --trials 20": "Compare two methods.",
-    "splinecli evaluate pmsData --method all --n-lights 5 --n-lights 10"
-    " --trials 20 --figures": "Compare all methods"
-    " with two numbers of lights, and draw their maps.",
-    "splinecli prepare --scenes 6 -o set": "Render six scenes in three materials.",
-    "splinecli prepare PRPS PRPS_Diffuse -o cycles": "Make a pixel set from the CyclesPS data.",
-    "splinecli train set --preset compact --steps 300 -o run": "Train briefly on a pixel set.",
-    "splinecli train -o runs/mine"
-    " --minutes 90": "Train new weights, then use --weights runs/mine/weights.safetensors.",
-    "splinecli train -o runs/mine --resume": "Continue after an interruption.",
-    "splinecli import-weights 200000-G.ckpt 200000-D.ckpt -o"
-    " official.safetensors": "Convert the authors' weights,"
-    " then use --weights official.safetensors.",
-}
-EXAMPLE_WIDTH = 64  # columns; with its indent an example fits a terminal of 80 columns
-
-
-def help_panels(command: Any, context: Any) -> dict[str, list[tuple[str, str]]]:
-    """Return the title of each panel of a command's help and its rows: names,
-    and what they mean.
-    """
-    panels: dict[str, list[tuple[str, str]]] = {}
-    for parameter in command.get_params(context):
-        if (record := parameter.get_help_record(context)) is None:
-            continue
-        term, meaning = record
-        title = getattr(parameter, "rich_help_panel", None) or "Options"
-        if parameter.param_type_name == "argument":
-            title, term, meaning = (
-                "Arguments",
-                parameter.metavar,
-                meaning.removesuffix("[required]"),
-            )
-        meaning = re.sub(r"\[default: \((.*)\)\]$", r"[default: \1]", meaning)
-        panels.setdefault(title, []).append((" ".join(term.split()), " ".join(meaning.split())))
-    return panels
 
 
 def man_pages() -> dict[str, str]:
@@ -148,7 +92,7 @@ def _overview(group: Any, context: Any, commands: dict[str, Any]) -> str:
             "splinecli", "surface normals from a few photographs under known lights", group, context
         ),
         ".SH OPTIONS",
-        *_options(help_panels(group, context)),
+        *_options({"Options": help_panels(group, context)["Options"]}),
         ".SH COMMANDS",
     ]
     for name, command in commands.items():
@@ -217,18 +161,10 @@ def _options(panels: dict[str, list[tuple[str, str]]]) -> list[str]:
 def _examples(name: str) -> list[str]:
     """Return the examples of a command, or all for an empty name."""
     lines = [".SH EXAMPLES"]
-    for command_line, meaning in EXAMPLES.items():
-        if name in ("", shlex.split(command_line)[1]):
-            lines += [_escape(meaning), ".PP", ".RS", ".nf", _escape(_wrap(command_line))]
-            lines += [".fi", ".RE", ".PP"]
+    for command_line, meaning in (examples_of(name) if name else EXAMPLES).items():
+        lines += [_escape(meaning), ".PP", ".RS", ".nf", _escape(wrap_example(command_line))]
+        lines += [".fi", ".RE", ".PP"]
     return lines[:-1]  # the next section starts its own paragraph
-
-
-def _wrap(command_line: str) -> str:
-    """Return a long command on several lines, with each option beside its value."""
-    whole = re.sub(r"( -\S+) (?!-)", "\\1\0", command_line)
-    lines = textwrap.wrap(whole, EXAMPLE_WIDTH, break_long_words=False, break_on_hyphens=False)
-    return " \\\n    ".join(lines).replace("\0", " ")
 
 
 def _page_text(lines: list[str], related: Iterable[str]) -> str:

@@ -1,6 +1,7 @@
 """The errors that splinecli raises on purpose. Each has an exit code and a hint with a remedy."""
 
 from collections.abc import Collection
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ class SplinecliError(Exception):
             stop.
         path: the file or folder that causes the failure, if any.
         line: the line in that file, counted from 1, if any.
-        hint: the remedy, as one sentence without the final full stop.
+        hint: the remedy, as one sentence without the final full stop, or a question.
 
     Examples:
         >>> from splinecli.errors import SplinecliError
@@ -53,7 +54,8 @@ class SplinecliError(Exception):
         self.line = line
         self.hint = hint
         place = "" if path is None else f"{path}: " if line is None else f"{path}:{line}: "
-        super().__init__(printable(f"{place}{problem}." + (f" {hint}." if hint else "")))
+        end = "" if (hint or "").endswith("?") else "."
+        super().__init__(printable(f"{place}{problem}." + (f" {hint}{end}" if hint else "")))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the error for another process."""
@@ -87,4 +89,11 @@ class OutputError(SplinecliError):
 def check_one_of(what: str, value: str, allowed: Collection[str]) -> None:
     """Raise UsageError for a value that is not allowed."""
     if value not in allowed:
-        raise UsageError(f"no {what} named {value!r}; expected one of {', '.join(allowed)}")
+        problem = f"no {what} named {value!r}; expected one of {', '.join(allowed)}"
+        raise UsageError(problem, hint=did_you_mean(value, allowed))
+
+
+def did_you_mean(value: object, names: Collection[str]) -> str | None:
+    """Return the hint "Did you mean NAME?" if a name is similar to the value."""
+    found = get_close_matches(str(value).lower(), names, 1, cutoff=0.7)
+    return f"Did you mean {found[0]}?" if found else None

@@ -122,7 +122,6 @@ def run(capfd, monkeypatch):
     The exit code must be `code`, stdout `out` and stderr `err`, where given, with `says` in stderr.
     """
     monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.setenv("TERMINAL_WIDTH", "100")
     monkeypatch.setattr(typer.main, "get_command", COMMAND)
 
     def call(command, *more, code=0, says=(), out=None, err=None):

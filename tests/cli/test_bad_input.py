@@ -137,6 +137,11 @@ infer X --stiffness 2
 info X --lights-format azel
 info X --light-frame exchanged
 infer X --device tpu
+infer X --device cud
+infer X --method LS
+infer X --maps preview,albdo
+info X --transfer sgrb
+train -o run --preset compat
 """
 
 

@@ -159,7 +159,7 @@ def test_a_film(run, document):
     assert [frame.stat().st_mtime_ns for frame in frames] == times
     # Of another film, nothing is replaced without --update.
     write_film(film, sphere_film(lights[::-1].copy()))
-    run(command, code=5, says=("frames of another film", "--update"))
+    run(command, code=5, says=("frames of another video", "--update"))
     assert [frame.stat().st_mtime_ns for frame in frames] == times
     run(f"{command} --update")
     assert sorted(Path("out/frames/clip").glob("*.png")) != frames
@@ -185,7 +185,7 @@ def test_films_that_cannot_be_used(run):
             f"{film} --lights estimate",
             "clip.avi: found 1 of 10 frames that are sharp and differ in their light",
         ),
-        (3, "none.mp4 --lights estimate", "the film does not exist"),
+        (3, "none.mp4 --lights estimate", "the video does not exist"),
         # a name that would lead out of OUT/frames is none of a film
         (3, "...mp4 --lights estimate", ""),
     ):

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 import typer
 
-from make_pages import EXAMPLES, FILES, man_pages
+from make_pages import FILES, man_pages
+from splinecli.cli.help import EXAMPLES
 from splinecli.cli.main import app
 from splinecli.estimate.methods import method_names
 from splinecli.estimate.networks.weights import shipped_names
@@ -37,6 +38,15 @@ COMMANDS = (
 @pytest.mark.parametrize("command", ["", *COMMANDS])
 def test_help_text(command, run, golden):
     golden(f"help{'_' * bool(command)}{command}.txt", run(f"{command} --help", err="").out)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_fits_a_narrow_terminal(command, run, monkeypatch):
+    """Descriptions have more than half of the width, so that the help is a few screens long."""
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = run(f"{command} --help").out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert len(lines) < 170
 
 
 def test_man_pages_are_up_to_date():

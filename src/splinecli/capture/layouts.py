@@ -183,7 +183,7 @@ def find_capture_files(
 
 
 def capture_name(folder: StrPath) -> str:
-    """Return the capture's name, from its folder or film; in CyclesPS <object>_<kind>. Raises
+    """Return the capture's name, from its folder or video; in CyclesPS <object>_<kind>. Raises
     InputError.
     """
     folder = Path(folder)

@@ -156,7 +156,7 @@ class RadiometricCalibration:
                 " srgb if they are sRGB."
             )
             return self, [*warnings, CaptureWarning(codes.DISPLAY_ENCODED, text)]
-        if curve not in (1, BT709):  # a film has no other curve
+        if curve not in (1, BT709):  # a video has no other curve
             how = (
                 "the profile says"
                 if isinstance(curve, tuple)

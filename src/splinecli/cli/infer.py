@@ -36,7 +36,7 @@ def infer(
 
     A CAPTURE is a folder with images of one object, taken by a fixed camera under different lights.
     The light file is in the folder, or is given by --lights. With --lights estimate, a CAPTURE may
-    be a film. Writes OUT/<name>/normals.png, normals.npy and report.json, and error_map.png if
+    be a video. Writes OUT/<name>/normals.png, normals.npy and report.json, and error_map.png if
     there is ground truth. With several captures, OUT/index.html links the results.
 
     Captures that are already done are skipped. If files or options of a capture have changed, infer
@@ -122,7 +122,7 @@ def _summary(report: dict[str, Any], output: Path) -> str:
 def watch(context: Context, options: WatchOptions) -> None:
     """Run infer on each capture that arrives in FOLDER, once it is complete.
 
-    A capture is a subfolder of FOLDER, or a film with --lights estimate. Each one is processed as
+    A capture is a subfolder of FOLDER, or a video with --lights estimate. Each one is processed as
     infer does with OPTIONS. Captures that are already done are skipped, so the command can be
     stopped and started again at any time. It continues after a capture fails, and tries that
     capture again when its files change. If FOLDER vanishes, the command waits for it. Ctrl-C or

@@ -21,7 +21,7 @@ from enum import Enum
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Literal, TextIO, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TextIO, get_origin, get_type_hints
 
 import typer
 from msgspec import NODEFAULT
@@ -41,6 +41,7 @@ from splinecli.cli.console import (
     print_lines,
     printed_documents,
 )
+from splinecli.cli.help import write_help
 from splinecli.cli.infer import infer, info, watch
 from splinecli.cli.signals import INTERRUPTED, TOLD
 from splinecli.errors import UsageError
@@ -48,6 +49,7 @@ from splinecli.records.base import (
     PANELS,
     Option,
     Record,
+    choices_of,
     complete_list,
     field_types,
     long_name,
@@ -107,11 +109,9 @@ def _parameter(name: str, option: Option, kind: Any, default: Any) -> inspect.Pa
     Record.from_arguments converts texts to numbers and lists.
     """
     typed, metavar, complete = plain(kind), option.metavar, option.complete
-    parts = (typed, *get_args(typed))
-    choices = next((get_args(part) for part in parts if get_origin(part) is Literal), ())
-    repeated = get_origin(typed) is list and not option.items
+    choices, repeated = choices_of(kind), get_origin(typed) is list and not option.items
     if choices:
-        metavar, complete = "|".join(choices), choices
+        metavar, complete = metavar or "|".join(choices), choices
     elif option.items:
         complete = complete_list(option.items)
     if choices or option.items or option.parse or number_of(kind):
@@ -254,11 +254,8 @@ class Command(TyperCommand):
         return option
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the help, without the Python types of arguments."""
-        for parameter in self.params:
-            if parameter.param_type_name == "argument":
-                parameter.display_type_rich = lambda ctx: None  # type: ignore[attr-defined]
-        super().format_help(ctx, formatter)
+        """Write the help by panels, with examples."""
+        write_help(self, ctx, formatter)
 
 
 def _expand(value: Any) -> Any:
@@ -273,10 +270,8 @@ class Commands(TyperGroup):
     """The command splinecli itself."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the help, without the Python types of flags."""
-        for option in self.get_params(ctx):
-            option.metavar = ""
-        super().format_help(ctx, formatter)
+        """Write the help as that of each command."""
+        write_help(self, ctx, formatter)
 
 
 app = typer.Typer(
@@ -286,9 +281,8 @@ app = typer.Typer(
     " SPLINE-Net).",
     epilog="Exit codes: 0 done, 1 defect, 2 usage, 3 bad input, 4 weights or configuration, 5"
     " output, 130 interrupted.",
-    rich_markup_mode="rich",
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 
 

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from splinecli.errors import UsageError
+from splinecli.errors import UsageError, did_you_mean
 from splinecli.maths import Float32Array, Float64Array, Floats
 
 _LINEAR_BELOW = 0.0031308  # linear value below which the sRGB curve is a straight line
@@ -21,7 +21,7 @@ AUTOMATIC = "auto"
 TransferCurve = float | tuple[float, ...] | None
 SRGB: TransferCurve = None
 _CODES = np.linspace(0, 1, 256)
-# The curve of most films (ITU-R BT.709), for values of 8 bits.
+# The curve of most videos (ITU-R BT.709), for values of 8 bits.
 BT709: TransferCurve = tuple(
     np.where(_CODES < 0.081, _CODES / 4.5, ((_CODES + 0.099) / 1.099) ** (1 / 0.45)).tolist()
 )
@@ -55,7 +55,8 @@ def parse_transfer(text: str) -> float | None:
             return gamma
     raise UsageError(
         f"the transfer curve is {text!r}; expected auto, linear, srgb, or gamma:G with G from 0.1"
-        " to 10"
+        " to 10",
+        hint=did_you_mean(text, named),
     )
 
 

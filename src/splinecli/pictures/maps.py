@@ -23,7 +23,7 @@ def encode_png(
 ) -> bytes:
     """Return the PNG file of an RGB picture (H, W, 3) or a gray picture (H, W) of 8 or 16 bits.
 
-    It has texts by keyword, in Latin-1 (PNG specification, tEXt). The values of a film have the
+    It has texts by keyword, in Latin-1 (PNG specification, tEXt). The values of a video have the
     primaries and the transfer curve of BT.709 (cICP). Raises OutputError if OpenCV cannot encode
     the picture.
     """

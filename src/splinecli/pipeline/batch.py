@@ -146,7 +146,7 @@ def _batch_item(folder: Path) -> BatchItem:
             path=folder,
             hint="Write lists with commas, such as --maps albedo,confidence",
         )
-    kind = "film" if is_film(folder) else "folder"
+    kind = "video" if is_film(folder) else "folder"
     missing = InputError(f"the {kind} does not exist", path=folder)
     return BatchItem(folder, name or str(folder), missing)
 

@@ -1,6 +1,6 @@
-"""Detect captures once they are complete: folders of images, and films.
+"""Detect captures once they are complete: folders of images, and videos.
 
-The frames of films are extracted.
+The frames of videos are extracted.
 """
 
 import json
@@ -24,7 +24,7 @@ from splinecli.system.files import is_folder, read_json
 from splinecli.system.progress import Observer
 from splinecli.system.publishing import held_folder, is_plain, new_files, refuse_link
 
-# the folder in the output folder of `infer` with a folder of frames for each film
+# the folder in the output folder of `infer` with a folder of frames for each video
 FOLDER = "frames"
 _RECORD = "film.json"
 _FRAME = re.compile(r"frame-\d{6,}\.png")
@@ -33,19 +33,19 @@ _FRAME = re.compile(r"frame-\d{6,}\.png")
 def unpacked(
     capture: Path, output: Path, reading: ReadingOptions, observer: Observer, *, redo: Redo
 ) -> Path:
-    """Return the capture or, for a film, the folder in `output` with its frames.
+    """Return the capture or, for a video, the folder in `output` with its frames.
 
-    The frames are extracted if needed. `redo` decides whether the frames of an earlier film are
-    kept, replaced if the film differs, or extracted again. Raises UsageError if options are about a
-    light file, InputError if the film cannot be read, or its light does not move, or OutputError if
-    the folder contains frames from another film, or other files, or the frames cannot be
+    The frames are extracted if needed. `redo` decides whether the frames of an earlier video are
+    kept, replaced if the video differs, or extracted again. Raises UsageError if options are about a
+    light file, InputError if the video cannot be read, or its light does not move, or OutputError if
+    the folder contains frames from another video, or other files, or the frames cannot be
     written.
     """
     if not is_film(capture):
         return capture
     if not (reading.finds_lights or reading.may_find_lights):
         raise UsageError(
-            f"{capture} is a film, whose lights have to be found",
+            f"{capture} is a video, whose lights have to be found",
             hint="Leave out options about lights that are given",
         )
     folder, stamp = output / FOLDER / capture.stem, digest([stamp_content(capture)])
@@ -61,7 +61,7 @@ def unpacked(
         )
         if others and (sizes or not all(map(_FRAME.fullmatch, others))):
             raise OutputError(
-                f"contains {others[0]}, which is not a frame of this film",
+                f"contains {others[0]}, which is not a frame of this video",
                 path=folder,
                 hint="Move it, or choose another -o",
             )
@@ -73,10 +73,10 @@ def unpacked(
             return folder
         if of_film not in (stamp, "") and redo == "nothing":
             raise OutputError(
-                "contains the frames of another film, or of an earlier version of this one",
+                "contains the frames of another video, or of an earlier version of this one",
                 path=folder,
-                hint="Add --update to extract the frames of this film, or choose another place with"
-                " -o",
+                hint="Add --update to extract the frames of this video, or choose another place"
+                " with -o",
             )
         with observer.progress(f"{capture.stem}: choosing frames", 1) as advance:
             numbers = choose_frames(capture)
@@ -91,7 +91,7 @@ def unpacked(
 
 
 class _Film(Struct):
-    """The film of a folder of frames, and their sizes."""
+    """The video of a folder of frames, and their sizes."""
 
     film: str
     sha256: str
@@ -99,7 +99,7 @@ class _Film(Struct):
 
 
 def _earlier(folder: Path) -> _Film:
-    """Return the record of the film whose frames are in the folder; empty without such frames."""
+    """Return the record of the video whose frames are in the folder; empty without such frames."""
     with suppress(OSError, ValueError):
         record: _Film = read_json(folder / _RECORD, _Film)
         if len(record.frames) >= FEWEST_FRAMES and all(map(_FRAME.fullmatch, record.frames)):
@@ -121,16 +121,16 @@ class _Seen:
 
     stamp: Stamp
     since: float
-    # its folders, or the film, with their modification times in nanoseconds
+    # its folders, or the video, with their modification times in nanoseconds
     folders: dict[str, int]
     looked_at: float  # when the stamp was last compared with the files
     returned: bool = False
 
 
 class Arrivals:
-    """The complete captures in a folder (its subfolders and films) that were not returned before.
+    """The complete captures in a folder (its subfolders and videos) that were not returned before.
 
-    A capture is complete when it contains a file named `marker`. Without a marker, and for films,
+    A capture is complete when it contains a file named `marker`. Without a marker, and for videos,
     it is complete when nothing in it has changed for `seconds`. Names that begin with a dot are
     ignored, and so is `without`, such as the folder of the results, which must not be a capture or
     be inside one. A capture that changes after it was returned is returned again; a file that is
@@ -154,7 +154,7 @@ class Arrivals:
     def take(self) -> list[Path]:
         """Return the captures that became complete since the last call, sorted naturally by name.
 
-        If the results of two captures have the same name, such as a folder and a film, the second
+        If the results of two captures have the same name, such as a folder and a video, the second
         is returned by the next call. Raises InputError if the folder cannot be read; afterwards,
         all its captures are returned again.
         """
@@ -206,7 +206,7 @@ def _changed(folder: str) -> int:
 
 
 def _stamp(capture: Path) -> tuple[Stamp, dict[str, int]]:
-    """Return the stamp of a film or of all files below a folder, and the folders; see _Seen.
+    """Return the stamp of a video or of all files below a folder, and the folders; see _Seen.
 
     Files that disappear in the meantime are ignored.
     """

@@ -37,6 +37,8 @@ from splinecli.maths.transfer import AUTOMATIC, parse_transfer
 from splinecli.recipe.work import RecipeOptions
 from splinecli.records import base as records
 from splinecli.records.base import (
+    NEAR,
+    SPECIAL,
     FileName,
     NotNegative,
     Option,
@@ -86,7 +88,7 @@ AsStored = Annotated[
 GivenWhiteLevel = Annotated[
     Positive | None,
     Option(
-        "Input",
+        SPECIAL,
         "Stored value from which a pixel is considered saturated.",
         "N",
         "found in the images",
@@ -100,19 +102,27 @@ Weights = Annotated[
     str | None,
     Option(
         "Method",
-        "Weights: a shipped name or a file.",
-        "NAME|FILE",
+        "Weights: a file, or a shipped name.",
+        "FILE",
         "the method's own",
         complete=complete_weights,
     ),
 ]
 DeviceName = Annotated[
     Device,
-    Option("Speed", "Device to compute on. auto is a CUDA GPU if there is one, else the CPU."),
+    Option(
+        "Speed",
+        "cpu, cuda (a GPU), or auto: the GPU if there is one.",
+        "DEVICE",
+    ),
 ]
 PrecisionName = Annotated[
     Precision,
-    Option("Speed", "Number format. auto is bfloat16 if the hardware supports it, else float32."),
+    Option(
+        "Speed",
+        "float32, bfloat16, or auto: bfloat16 if the hardware supports it.",
+        "FORMAT",
+    ),
 ]
 Quiet = Annotated[bool, Option("Output", "Print nothing but errors.", names="--quiet -q")]
 Overwrite = Annotated[bool, Option("Output", "Replace earlier results.")]
@@ -145,9 +155,9 @@ class WorkerOptions(Record, frozen=True, kw_only=True):
 
     workers: int = option(
         "Processes and machines",
-        "Number of parallel processes on this machine (needs the extra 'cluster'). auto chooses"
-        " by cores and memory.",
-        "N|auto",
+        "Number of parallel processes on this machine, or auto to choose by cores and memory"
+        " (needs the extra 'cluster').",
+        "N",
         value=1,
         parse=parse_workers,
     )
@@ -159,9 +169,9 @@ class ClusterOptions(WorkerOptions, frozen=True, kw_only=True):
     # the address or the scheduler file of a Dask scheduler
     address: str | None = option(
         "Processes and machines",
-        "Compute on the workers of a running Dask cluster: the address of its scheduler, or its"
-        " scheduler file (needs the extra 'cluster').",
-        "ADDRESS|FILE",
+        "Compute on a running Dask cluster: the address of its scheduler, or its scheduler file"
+        " (needs the extra 'cluster').",
+        "ADDRESS",
         names="--cluster",
     )
     gpu: bool = False  # whether only workers with the Dask resource GPU are used
@@ -205,7 +215,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
         " exposures.",
     )
     ground_truth: FileName | None = option(
-        "Input", "True normals to compare with (.mat, .npy, text, PNG, TIFF).", "FILE"
+        SPECIAL, "True normals to compare with (.mat, .npy, text, PNG, TIFF).", "FILE"
     )
     transfer: str = option(
         "Input",
@@ -219,24 +229,24 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
         "Input", "Image taken without the lights, to subtract from all images.", "FILE", "ambient.*"
     )
     flat_field: FileName | None = option(
-        "Input",
+        SPECIAL,
         "Folder with images of a uniform white surface: one for all lights, or one for each light.",
         "DIR",
     )
     white_level: GivenWhiteLevel = None
     lights: FileName | None = option(
         "Lights",
-        f"Light directions ({light_suffixes()}): x y z for each image, z to the camera. estimate"
-        " derives them from the images, less accurately than a calibration.",
-        "FILE|estimate",
+        f"File of the light directions ({light_suffixes()}): x y z for each image, z to the camera."
+        " Or the word estimate: derive them from the images, less accurately than a calibration.",
+        "FILE",
         "the light file in CAPTURE",
     )
     first_light: str | None = option(
         "Lights",
-        "With --lights estimate: the side that the first light comes from, such as left, above or"
-        " upper-left, or its azimuth, counter-clockwise from the right. Needed if the images show"
-        " no outline of the object.",
-        "SIDE|DEGREES",
+        "With --lights estimate: side that the first light comes from, such as left, above or"
+        " upper-left, or its azimuth in degrees, counter-clockwise from the right. Needed if the"
+        " images show no outline of the object.",
+        "SIDE",
         complete=tuple(SIDES_DEG),
     )
     light_frame: str | None = option(
@@ -248,51 +258,51 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
         complete=records.complete_list(("x-left", "y-down", "z-away", EXCHANGED)),
     )
     light_format: LightForm = option(
-        "Lights",
+        SPECIAL,
         "Form of a light in a text file: xyz, a vector; azel, azimuth and elevation; or"
         " slant-tilt, the angles of HALCON. Angles are in degrees.",
+        "FORM",
         value="xyz",
     )
     intensities: FileName | None = option(
         "Lights",
-        "Light intensities: a line r g b for each image.",
-        "FILE|equal",
-        "equal, or estimated if the images show that they differ",
+        "File of the light intensities: a line r g b for each image. Or the word equal.",
+        "FILE",
+        "equal, or estimated if the images differ clearly",
     )
     lights_in_channels: bool = flag(
-        "Lights",
-        "The channels of each colour image are photographs under three coloured lamps; the light"
-        " file has three lights for each image, in the order R, G, B. For gray objects.",
+        SPECIAL,
+        "The channels of a colour image are photographs of a gray object under three coloured"
+        " lamps; the light file has three lights for each image, in the order R, G, B.",
     )
     crosstalk: FileName | None = option(
-        "Lights",
-        "With --lights-in-channels: 3 x 3 responses to the lamps, one line for each of the"
-        " channels R, G, B.",
+        SPECIAL,
+        "With --lights-in-channels: responses of the channels R, G, B (lines) to the three lamps.",
         "FILE",
         "crosstalk.txt in CAPTURE, or none",
     )
     light_positions: FileName | None = option(
-        "Lights",
-        "Near lamps: a line x y z for each image, in any unit, from the middle of the image.",
+        NEAR,
+        "Positions of near lamps: a line x y z for each image, in any unit, from the middle of the"
+        " image.",
         "FILE",
         "light_positions.txt in CAPTURE",
     )
     light_distance: Positive | None = option(
-        "Lights", "Near lamps: the distance of all lamps from the middle of the object.", "D"
+        NEAR, "Distance of near lamps from the middle of the object.", "D"
     )
     pixel_size: Positive | None = option(
-        "Lights",
-        "Near lamps: the width of a pixel on the object.",
+        NEAR,
+        "Width of a pixel on the object, in the unit of the lamps.",
         "S",
         "pixel_size.txt in CAPTURE",
     )
     object_width: Positive | None = option(
-        "Lights", "Near lamps: the width of the object in its mask, instead of --pixel-size.", "W"
+        NEAR, "Width of the object in its mask, instead of --pixel-size.", "W"
     )
     camera_matrix: FileName | None = option(
-        "Lights",
-        "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera: each pixel is"
-        " then estimated in the frame of its viewing ray.",
+        NEAR,
+        "Text file of the 3 x 3 camera matrix in pixels, for a perspective camera.",
         "FILE",
         "camera_matrix.txt in CAPTURE, or orthographic",
     )
@@ -473,8 +483,8 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
     as_stored: AsStored = False
     refine_lights: RefineLights = False
     pixel_size: Positive | None = option(
-        "Lights",
-        "Near lamps: the width of a pixel on the object, in the unit of the lamps. With"
+        NEAR,
+        "Width of a pixel on the object, in the unit of the lamps. With"
         " --surface: in millimetres, for a surface in millimetres.",
         "S",
         "pixel_size.txt in CAPTURE",
@@ -484,7 +494,7 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
     )
     seed: RandomSeed = 0
     light_indices: tuple[int, ...] | None = option(
-        "Lights",
+        SPECIAL,
         "Use these lights, counted from 0. Plots and warnings count from 1.",
         "I,J,...",
         parse=partial(parse_indices, title="--light-indices"),
@@ -500,8 +510,8 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
     distil: bool | None = option(
         "Speed",
         "Approximate the network with a smaller one, trained on a sample of the capture's pixels,"
-        " or use the method on every pixel.",
-        default="--distil from 100,000 pixels, else --exact",
+        " or apply it to every pixel.",
+        default="--distil from 100,000 pixels",
         names="--distil/--exact",
     )
     device: DeviceName = "auto"
@@ -511,9 +521,8 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
     )
     formats: tuple[str, ...] = option(
         "Output",
-        f"Files of the normal map: any of {records.listed(NORMALS)}. png has 16 bits, png8 has 8,"
-        " npy and tiff are float32. With exr (needs the extra 'exr'), albedo and depth are"
-        " written as EXR, too.",
+        f"Files of the normal map: any of {records.listed(NORMALS)}. png has 16 bits, png8 has 8;"
+        " the others are float32. exr (needs the extra 'exr') also applies to albedo and depth.",
         "LIST",
         value=("png", "npy"),
         names="--format",
@@ -521,9 +530,8 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
     )
     maps: tuple[str, ...] = option(
         "Output",
-        f"Further maps to write: any of {records.listed(MAPS)}. preview is a shaded image."
-        " relief:2 makes heights of 2 pixels white in the picture, and curvature:0.1 a mean"
-        " curvature of 0.1 per pixel.",
+        f"Further maps: any of {records.listed(MAPS)}. preview is a shaded image. relief:2 makes"
+        " heights of 2 pixels white in the picture, curvature:0.1 a curvature of 0.1 per pixel.",
         "LIST",
         value=(),
         items=MAPS,
@@ -533,10 +541,11 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
     surface: bool = flag(
         "Output", "Also write mesh.glb, mesh.ply, and depth.npy, .tiff and .png, as integrate does."
     )
-    discontinuity: NotNegative = option("Output", DISCONTINUITY_HELP, "K", value=DISCONTINUITY)
+    discontinuity: NotNegative = option(SPECIAL, DISCONTINUITY_HELP, "K", value=DISCONTINUITY)
     convention: Convention = option(
-        "Output",
+        SPECIAL,
         "Green channel of the PNG files: opengl is y up, directx is y down.",
+        "NAME",
         value="opengl",
     )
 
@@ -660,7 +669,7 @@ class BatchOptions(Record, frozen=True, kw_only=True):
 
     captures: tuple[Path, ...] = option(
         "Arguments",
-        "Folders with the images of one object each, or films.",
+        "Folders with the images of one object each, or videos.",
         "CAPTURE",
         value=NODEFAULT,
     )
@@ -695,7 +704,7 @@ class WatchOptions(Record, frozen=True, kw_only=True):
 
     folder: Path = option(
         "Arguments",
-        "Folder in which captures arrive, each as a subfolder or a film.",
+        "Folder in which captures arrive, each as a subfolder or a video.",
         "FOLDER",
         value=NODEFAULT,
     )
@@ -707,7 +716,7 @@ class WatchOptions(Record, frozen=True, kw_only=True):
     )
     settle: NotNegative = option(
         "Captures",
-        "A film, or a subfolder without --marker, is complete when it has not changed for this"
+        "A video, or a subfolder without --marker, is complete when it has not changed for this"
         " long.",
         "SECONDS",
         value=5.0,
@@ -718,7 +727,7 @@ class InfoOptions(Display, frozen=True, kw_only=True):
     """The options of `info` in addition to ReadingOptions; see its help."""
 
     capture: Path = option(
-        "Arguments", "Folder with the images of one object, or a film.", "CAPTURE", value=NODEFAULT
+        "Arguments", "Folder with the images of one object, or a video.", "CAPTURE", value=NODEFAULT
     )
     auto_mask: bool = flag("Input", "If there is no mask, find the object in the images.")
     check_lights: bool = flag(

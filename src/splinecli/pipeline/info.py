@@ -46,7 +46,7 @@ def describe_capture(
     the images, or options contradict.
     """
     reading, plot, mended_lights = reading or ReadingOptions(), options.plot, options.mended_lights
-    with TemporaryDirectory() as frames:  # extracted from a film
+    with TemporaryDirectory() as frames:  # extracted from a video
         folder = unpacked(options.capture, Path(frames), reading, observer, redo="all")
         source = reading.open(folder)
         for name, given in (

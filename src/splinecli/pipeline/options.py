@@ -196,7 +196,8 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
     convention: Convention | None = option(
         "Input",
         "Green channel of a normal map of colours: opengl is y up, directx is y down.",
-        default="as in report.json beside it, or opengl",
+        "NAME",
+        "as in report.json beside it, or opengl",
     )
     colours: Path | None = option(
         "Input",
@@ -232,10 +233,9 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
     )
     level: tuple[tuple[int, int], ...] | None = option(
         "Method",
-        "Level the surface, and write its normals: plane removes the slope of its dominant plane;"
-        " three or"
-        ' more pixels "X,Y X,Y X,Y" define the plane that becomes level.',
-        "plane|POINTS",
+        'Level the surface, and write its normals: three or more pixels "X,Y X,Y X,Y" define the'
+        " plane that becomes level, or the word plane chooses the dominant one.",
+        "POINTS",
         parse=parse_level,
     )
     output: Path | None = option(
@@ -343,8 +343,8 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
     )
     n_lights: tuple[int | None, ...] = option(
         "Lights",
-        "Number of lights in each draw. May be repeated.",
-        "K|all",
+        "Number of lights in each draw, or all. May be repeated.",
+        "K",
         str(DEFAULT_LIGHTS),
         value=(),
         parse=parse_light_count,

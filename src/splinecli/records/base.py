@@ -12,7 +12,6 @@ import types
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, is_dataclass
-from difflib import get_close_matches
 from functools import lru_cache, partial
 from math import isfinite
 from pathlib import Path
@@ -31,13 +30,13 @@ from typing import (
 from msgspec import Meta, Struct, StructMeta, ValidationError, convert, to_builtins
 from msgspec.structs import fields, replace
 
-from splinecli.errors import SplinecliError, UsageError, check_one_of
+from splinecli.errors import SplinecliError, UsageError, check_one_of, did_you_mean
 
-ARGUMENTS = "Arguments"
+ARGUMENTS, NEAR, SPECIAL = "Arguments", "Near lamps and perspective", "Special cases"
 # The panels of the help, in order
 PANELS = [
     *(ARGUMENTS, "Captures", "Input", "Settings", "Pixels", "Scenes", "Length", "Lights"),
-    *("Light intensities", "Method", "Output", "Speed", "Processes and machines"),
+    *("Light intensities", "Method", "Output", "Speed", NEAR, "Processes and machines", SPECIAL),
 ]
 PATH = object()
 FileName = Annotated[str, PATH]  # a path that is stored as text
@@ -83,9 +82,8 @@ class Option:
             names = tuple(item.strip() for item in given.split(",") if item.strip())
             for name in names:
                 if name not in self.items:
-                    near = get_close_matches(name, self.items, 1) or list(self.items)
                     problem = f"{title} has {name!r}; expected a list of {', '.join(self.items)}"
-                    raise UsageError(f"{problem}, such as {near[0]}")
+                    raise UsageError(problem, hint=did_you_mean(name, self.items))
             if not names:
                 raise UsageError(f"{title} is empty; expected a list of {', '.join(self.items)}")
             return names
@@ -217,7 +215,8 @@ def settings(
     kinds = field_types(record)
     for name in values:
         if name not in kinds:
-            raise error(f"unknown {noun} {name!r}; known are {', '.join(sorted(kinds))}")
+            problem = f"unknown {noun} {name!r}; known are {', '.join(sorted(kinds))}"
+            raise error(problem, hint=did_you_mean(name, kinds))
     return {
         name: converted(kinds[name], value, f"{noun} {name!r}", error)
         for name, value in values.items()
@@ -239,7 +238,15 @@ def converted(
         items = found.values() if isinstance(found, dict) else _each(found)
         if all(isfinite(item) for item in items if isinstance(item, float)):
             return found
-    raise error(f"{title} is {value!r}; expected {kind_in_words(kind)}")
+    problem = f"{title} is {value!r}; expected {kind_in_words(kind)}"
+    raise error(problem, hint=did_you_mean(value, choices_of(kind)))
+
+
+def choices_of(kind: Any) -> tuple[str, ...]:
+    """Return the names that a field may have, or () if it is not limited to names."""
+    bare = plain(kind)
+    parts = (bare, *get_args(bare))
+    return next((get_args(part) for part in parts if get_origin(part) is Literal), ())
 
 
 def option_of(kind: Any) -> Option | None:

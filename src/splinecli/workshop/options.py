@@ -111,8 +111,8 @@ class TrainOptions(Record, frozen=True, kw_only=True):
     )
     start_from: str | None = option(
         "Settings",
-        "Begin with these weights.",
-        "NAME|FILE",
+        "Begin with these weights: a file, or a shipped name.",
+        "FILE",
         "random weights; preset refine: spline-net",
         complete=shared.complete_weights,
     )
@@ -122,8 +122,8 @@ class TrainOptions(Record, frozen=True, kw_only=True):
     )
     n_lights: dict[str, int] | None = option(
         "Pixels",
-        "Number of lights of each pixel.",
-        "K|MIN-MAX",
+        "Number of lights of each pixel, or a range such as 4-96.",
+        "K",
         "the preset's",
         parse=parse_light_counts,
     )

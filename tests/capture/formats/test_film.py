@@ -101,10 +101,10 @@ def test_code_points_go_before_other_curves(tmp_path, number, curve):
 
 def test_what_is_no_film_or_truncated_is_refused(tmp_path):
     for content, problem in (
-        (b"", "found no film"),
-        (b"#EXTM3U\n#EXTINF:1,\nother.ts\n", "found no film"),
-        (b"ffconcat version 1.0\nfile other.mp4\n", "found no film"),
-        (b"\0\0\0\x18ftypisom" + bytes(200), "the film is damaged"),
+        (b"", "found no video"),
+        (b"#EXTM3U\n#EXTINF:1,\nother.ts\n", "found no video"),
+        (b"ffconcat version 1.0\nfile other.mp4\n", "found no video"),
+        (b"\0\0\0\x18ftypisom" + bytes(200), "the video is damaged"),
     ):
         path = tmp_path / "clip.mp4"
         path.write_bytes(content)

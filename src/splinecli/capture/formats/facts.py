@@ -79,7 +79,7 @@ class StatedCurve:
 
 
 _ENCODED = StatedCurve(SRGB, "PNG that says so")
-_CODE_POINTS = dict.fromkeys((1, 6, 14, 15), StatedCurve(BT709, "PNG of a film")) | {
+_CODE_POINTS = dict.fromkeys((1, 6, 14, 15), StatedCurve(BT709, "PNG of a video")) | {
     8: StatedCurve(),
     13: _ENCODED,
 }

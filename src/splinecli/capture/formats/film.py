@@ -1,4 +1,4 @@
-"""Films as captures: a fixed camera films an object while a lamp is carried around it.
+"""Videos as captures: a fixed camera records an object while a lamp is carried around it.
 
 Only a few of the hundreds of frames are needed: sharp ones, not overexposed, with lights as
 different as possible.
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     import cv2
 
 MOST_FRAMES, FEWEST_FRAMES = 24, 6
-_CANDIDATES = 1000  # most frames that are compared; longer films are subsampled by 2, 4 and so on
+_CANDIDATES = 1000  # most frames that are compared; longer videos are subsampled by 2, 4 and so on
 # FFmpeg recognises playlists by their content, and these name other files. So only containers of
-# films are opened.
+# videos are opened.
 _CONTAINERS = re.compile(rb"....(ftyp|moov|mdat|wide)|RIFF|\x1a\x45\xdf\xa3", re.DOTALL)
 # A frame that may be chosen: its number, its linear thumbnail, its sharpness and its share of
 # clipped pixels.
@@ -38,7 +38,7 @@ _Candidate = tuple[int, Float32Array, float, float]
 
 
 def is_film(path: Path) -> bool:
-    """Return whether the path has the name of a film, and is not a folder."""
+    """Return whether the path has the name of a video, and is not a folder."""
     suffixes = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
     return path.suffix.lower() in suffixes and path.stem.strip(".") != "" and not is_folder(path)
 
@@ -47,7 +47,7 @@ def choose_frames(film: Path) -> tuple[int, ...]:
     """Return the numbers, from 0 and rising, of FEWEST_FRAMES to MOST_FRAMES frames whose lights
     differ most.
 
-    Raises InputError if the film cannot be read, or its light does not move.
+    Raises InputError if the video cannot be read, or its light does not move.
     """
     numbers, thumbnails, sharpness, clipped = map(np.array, zip(*_candidates(film), strict=True))
     light = thumbnails.mean(axis=1)
@@ -67,7 +67,7 @@ def choose_frames(film: Path) -> tuple[int, ...]:
             f"found {len(chosen)} of {len(numbers)} frames that are sharp and differ in their"
             f" light, expected at least {FEWEST_FRAMES}",
             film,
-            hint="Film from a tripod while the lamp moves all around the object,"
+            hint="Record from a tripod while the lamp moves all around the object,"
             " with focus and exposure locked",
         )
     return tuple(sorted(numbers[usable][chosen].tolist()))
@@ -110,7 +110,7 @@ def _candidates(film: Path) -> list[_Candidate]:
             raise ValueError
     if number < 0.8 * stated:
         raise InputError(
-            f"the film breaks off: {number} of {stated:.0f} frames can be read",
+            f"the video breaks off: {number} of {stated:.0f} frames can be read",
             film,
             hint="Copy it again",
         )
@@ -158,22 +158,22 @@ def _farthest(thumbnails: Float32Array) -> list[int]:
 
 @contextmanager
 def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
-    """Yield an opened film, and convert the errors of a damaged one to an InputError."""
+    """Yield an opened video, and convert the errors of a damaged one to an InputError."""
     import cv2
 
-    check_file(film, "a film")
-    problem = "the film is damaged, or in a form that cannot be read"
+    check_file(film, "a video")
+    problem = "the video is damaged, or in a form that cannot be read"
     hint = "Copy it again, or convert it to MP4 with H.264"
     with damage_as_input_error(film, problem, hint), film.open("rb") as file:
         if not _CONTAINERS.match(file.read(16)):
             raise InputError(
-                "found no film",
+                "found no video",
                 film,
-                hint="MP4, MOV, AVI, MKV and WebM files are read as films",
+                hint="MP4, MOV, AVI, MKV and WebM files are read as videos",
             )
         file.seek(0)
         # FFmpeg's threads print between the calls, too. OpenCV reads this before it opens its first
-        # film.
+        # video.
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
         with native_stderr():
             video = cv2.VideoCapture(utf8_name(film, file), cv2.CAP_FFMPEG)

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from splinecli.errors import ModelError
+from splinecli.errors import ModelError, did_you_mean
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.li_ne_net import CaptureHead
 from splinecli.estimate.networks.spline_net import SplineNet
@@ -99,7 +99,8 @@ def resolve_weights(name_or_file: str) -> LoadedNetwork:
             names = ", ".join(shipped_names())
             raise ModelError(
                 f"no weights named {name_or_file!r}; expected one of {names}, or a .safetensors"
-                " file"
+                " file",
+                hint=did_you_mean(name_or_file, shipped_names()),
             )
         return load_weights(path)
     with resources.as_file(SHIPPED / entry["file"]) as path:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from splinecli.capture.formats.numbers import read_lines
-from splinecli.errors import InputError, ModelError, UsageError
+from splinecli.errors import InputError, ModelError, UsageError, check_one_of
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.weights import shipped_names
 from splinecli.records.base import BelowOne, Count, Natural, NotNegative, Share, settings
@@ -224,8 +224,7 @@ PRESETS = {
 
 def preset(name: str, **changes: Any) -> TrainingConfig:
     """Return a preset with some settings changed. Raises UsageError for an unknown name."""
-    if name not in PRESETS:
-        raise UsageError(f"no preset named {name!r}; expected one of {', '.join(PRESETS)}")
+    check_one_of("preset", name, PRESETS)
     return replace(PRESETS[name], **changes)
 
 
