@@ -66,19 +66,19 @@ def beside_published(measured: Measured) -> Figure:
     columns = [f"{label} 10" for label in OBJECTS]
     rows = {**measured[PUBLISHED]["rows"], **ours}
     rows = {name: cells for name, cells in rows.items() if set(columns) <= cells.keys()}
-    figure = empty_figure("")
-    axes = figure.axes[0]
-    width = 0.8 / len(rows)
-    for k, (name, cells) in enumerate(rows.items()):
-        colour = (
-            COLOURS["spline-net"]
-            if name == "spline-net (ours)"
-            else str(0.85 - 0.5 * k / len(rows))
-        )
-        places = [x + (k - (len(rows) - 1) / 2) * width for x in range(len(columns))]
-        axes.bar(places, [cells[column] for column in columns], width, color=colour, label=name)
-    axes.set_xticks(range(len(columns)), list(OBJECTS))
-    axes.legend(frameon=False, fontsize="small")
+    figure = Figure(figsize=(8, 2.6), layout="constrained")
+    colours = [COLOURS["spline-net" if name == "spline-net (ours)" else "ls"] for name in rows]
+    panels = figure.subplots(1, len(columns), sharey=True)
+    for axes, title, column in zip(panels, OBJECTS, columns, strict=True):
+        errors = [cells[column] for cells in rows.values()]
+        axes.bar_label(axes.barh(list(rows), errors, color=colours), fmt="%.1f", padding=3)
+        axes.set_title(title)
+        axes.set_xticks([])
+        axes.margins(x=0.2)
+        axes.tick_params(left=False)
+        axes.spines[["top", "right", "bottom"]].set_visible(False)
+    panels[0].invert_yaxis()
+    figure.supxlabel("mean angular error in degrees")
     return figure
 
 

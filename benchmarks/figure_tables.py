@@ -121,6 +121,34 @@ class Table:
         return "\n".join(lines) + f"\n\n{' '.join(captions)}"
 
 
+class Headline:
+    """The sentence at the top of the README: our errors beside the best published ones."""
+
+    def text(self, measured: Measured, weights: str) -> str:
+        """Return the sentence, or a mark if the shipped weights were not measured."""
+        ours = measured.get("lights-10", {"weights": ""})
+        if ours["weights"] != weights:
+            return "(not measured with these weights)"
+        published = measured[PUBLISHED]["rows"].values()
+        keys = [f"{label} 10" for label in OBJECTS]
+        best = [min(cells[key] for cells in published if key in cells) for key in keys]
+        errors = [ours["rows"]["spline-net"][key] for key in keys]
+        return (
+            f"With ten lights, the mean angular errors on {listed(OBJECTS)} of the DiLiGenT"
+            f" benchmark are\n{numbers(errors)} degrees; the best of the published methods in the"
+            f" [table](#accuracy) reach {numbers(best)}."
+        )
+
+
+def numbers(values: Iterable[float]) -> str:
+    return listed([f"{value:.1f}" for value in values])
+
+
+def listed(words: Iterable[str]) -> str:
+    *most, last = words
+    return f"{', '.join(most)} and {last}"
+
+
 def caption(measurement: Mapping[str, Any], weights: str) -> str:
     """Return which version, weights and machine a measurement is of. Other weights than the shipped
     are marked.
@@ -142,7 +170,8 @@ def code(keys: Iterable[str]) -> dict[str, str]:
     return {f"`{key}`": key for key in keys}
 
 
-TABLES = {
+TABLES: dict[str, Table | Headline] = {
+    "headline": Headline(),
     "ten-lights": Table(
         ("lights-10", PUBLISHED),
         "method",

@@ -7,6 +7,7 @@ the site's layout.
 
 import posixpath
 import re
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,14 @@ PAGES = (
     "CHANGELOG.md",
     "examples/README.md",
 )
-SCRIPTS = ("examples/python_api.py", "examples/train_shipped_weights.sh")
+SCRIPTS = (
+    "examples/python_api.py",
+    "examples/train_shipped_weights.sh",
+    "examples/quickstart.ipynb",
+    "CITATION.cff",
+)
 COMMANDS = "commands"
+LONG_ROWS = 30  # of a table that is folded on a phone
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -40,6 +47,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Return the text of a page with the links of the site."""
     here = page.file.src_uri
+    if here == "CHANGELOG.md":
+        markdown = fold_versions(markdown)
     if here.startswith(f"{COMMANDS}/"):
         return markdown
     named = {site_name(name): name for name in PAGES}
@@ -52,6 +61,40 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         return "](" + posixpath.relpath(target, posixpath.dirname(here) or ".")
 
     return re.sub(r"\]\(([^)\s#]+)", link, markdown)
+
+
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Return the page with marks on options and tables, which assets/site.css uses."""
+    html = re.sub("<code>(?=--?[a-z][^ <]*( [^ <]+)?</code>)", '<code class="option">', html)
+    return re.sub(r"<table>\n.*?</table>", words_table, html, flags=re.DOTALL)
+
+
+def words_table(found: re.Match[str]) -> str:
+    """Return an HTML table whose cells name their columns; one of numbers is not changed."""
+    table = found[0]
+    if "text-align: right" in table:
+        return table
+    head = [re.sub("<.*?>", "", cell) for cell in re.findall("<th>(.*?)</th>", table)]
+
+    def row(cells: re.Match[str]) -> str:
+        labels = iter(head)
+        return re.sub("<td>", lambda _: f'<td data-label="{next(labels)}">', cells[0])
+
+    table = re.sub(r"<tr>\n<td>.*?</tr>", row, table, flags=re.DOTALL)
+    table = table.replace("<table>", "<table data-words>")
+    rows = table.count("<tr>") - 1
+    if rows < LONG_ROWS:
+        return table
+    return f'<details class="note long" open><summary>{rows} rows</summary>{table}</details>'
+
+
+def fold_versions(changelog: str) -> str:
+    """Return the changelog with the versions folded after the first section."""
+    first, *versions = re.split(r"^## (?!Unreleased)", changelog, flags=re.MULTILINE)
+    folded = (version.partition("\n") for version in versions)
+    return first + "\n".join(
+        f'??? note "{name}"\n\n{textwrap.indent(text, "    ")}' for name, _, text in folded
+    )
 
 
 def site_name(name: str) -> str:
@@ -93,5 +136,6 @@ def command_pages() -> dict[str, str]:
 
 
 def plain(text: str) -> str:
-    """Return text without a meaning in Markdown."""
-    return re.sub(r"([|*_\\])", r"\\\1", text).replace("<", "&lt;")
+    """Return text without a meaning in Markdown, and its options as code."""
+    text = re.sub(r"([|*_\\])", r"\\\1", text).replace("<", "&lt;")
+    return re.sub(r"(?<![\w`-])--?[a-z][\w-]*", r"`\g<0>`", text)

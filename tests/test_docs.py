@@ -111,6 +111,13 @@ def test_commands_have_options_that_exist(page, command):
             assert word in options
 
 
+def test_the_version_is_the_same_everywhere():
+    """The README and CITATION.cff cite the version of the package."""
+    version = re.search(r'^version = "(.*)"$', text_of("pyproject.toml"), re.MULTILINE)[1]
+    assert f"version: {version}\n" in text_of("CITATION.cff")
+    assert f"version = {{{version}}}" in text_of("README.md")
+
+
 def test_exit_codes():
     codes = dict(re.findall(r"^\| (\d+) \| (.*) \|$", text_of("docs/warnings.md"), re.MULTILINE))
     assert codes.keys() == {"0", "1", "2", "3", "4", "5", "130"}

@@ -1,10 +1,15 @@
 """The functions for notebooks: the same normals as `splinecli infer`, from arrays."""
 
+import base64
+import contextlib
+import io
+import json
 import subprocess
 import sys
 from pathlib import Path
 
 import cv2
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -40,6 +45,51 @@ def matte(dtype=np.float64, scale=1.0):
     normals = np.stack((x, y, np.ones_like(x)), axis=-1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     return (scale * np.moveaxis(normals @ FOUR_LIGHTS.T, -1, 0)).astype(dtype), normals
+
+
+def outputs_of(source, names):
+    """Run a cell and return what Jupyter would store of it: its text, and its figures."""
+    figures = []
+
+    def keep_figure():
+        file = io.BytesIO()
+        plt.savefig(file, format="png", dpi=60, bbox_inches="tight")
+        plt.close()
+        figures.append(base64.b64encode(file.getvalue()).decode("ascii"))
+
+    with contextlib.redirect_stdout(io.StringIO()) as out, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plt, "show", keep_figure)
+        exec(source, names)
+    text = out.getvalue().splitlines(keepends=True)
+    stream = {"name": "stdout", "output_type": "stream", "text": text}
+    shown = [
+        {"data": {"image/png": png}, "metadata": {}, "output_type": "display_data"}
+        for png in figures
+    ]
+    return [stream] * bool(text) + shown
+
+
+def test_quickstart(request, monkeypatch):
+    """The stored outputs are those of its cells; --update-golden stores them anew."""
+    monkeypatch.chdir(MEDALLION.parent)
+    plt.switch_backend("agg")
+    notebook, names = read_json("quickstart.ipynb"), {}
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    stored = [cell["outputs"] for cell in cells]
+    for number, cell in enumerate(cells, start=1):
+        cell["outputs"] = outputs_of("".join(cell["source"]), names)
+        cell["execution_count"] = number
+    if request.config.getoption("--update-golden"):
+        text = json.dumps(notebook, indent=1, ensure_ascii=False)
+        Path("quickstart.ipynb").write_text(text + "\n", "utf-8")
+        return
+    for before, cell in zip(stored, cells, strict=True):
+        found, expected = (
+            [(output["output_type"], output.get("text")) for output in outputs]
+            for outputs in (cell["outputs"], before)
+        )
+        assert found == expected
+    assert names["error_deg"].mean() < 1.7
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")

@@ -141,7 +141,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         (
             "expect",
             f"{report['expect']['memory_mib']} MiB of memory and about"
-            f" {report['expect']['seconds']} s on a laptop,"
+            f" {report['expect']['seconds']} s on this machine,"
             f" {report['expect']['seconds_with_surface']} s with --surface",
         ),
     ]

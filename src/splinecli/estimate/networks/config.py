@@ -74,7 +74,7 @@ Width = Annotated[int, Meta(ge=1, le=4096)]
 class NetworkConfig:
     """The layers of a SPLINE-Net or a CNN-PS."""
 
-    # "paper" has the layers of the authors' networks. "compact" is made for laptop cores.
+    # "paper" has the layers of the authors' networks. "compact" is made for processors.
     size: Literal["paper", "compact"] = "compact"
     # cells along a side of the observation map
     map_size: Annotated[int, Meta(ge=8, le=128, multiple_of=4)] = MAP_SIZE
