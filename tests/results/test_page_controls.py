@@ -83,6 +83,40 @@ def test_mouse_keys_and_a_narrow_screen(open_page, webgl):
     assert left == 0 and width > 1 and abs(top + height - SIDE) < 1e-9  # never outside the map
 
 
+def test_the_address_leads_to_the_same_view(open_page):
+    html = result_page(REPORT, *ball(), values={"albedo": ball()[0] + 1})
+    page = open_page(html, width=800, height=600)
+    page.evaluate("splinecli.ready")
+    assert page.evaluate("location.hash") == ""
+    page.locator("input[value=specular]").check()
+    page.locator("#coloured").uncheck()
+    page.evaluate("splinecli.setLight(0.5, -0.25)")
+    page.evaluate("splinecli.show(2, 80, 100)")
+    page.evaluate("document.getElementById('tint').value = '#ffcc88'")
+    wait_until(page, "location.hash.includes('zoom')")
+    fragment = page.evaluate("location.hash")[1:]
+    other = open_page(html, fragment, width=800, height=600)
+    other.evaluate("splinecli.ready")
+    lights_are(other, 0.5, -0.25, "light")
+    assert_allclose(other.evaluate("splinecli.region"), page.evaluate("splinecli.region"), atol=0.1)
+    assert other.locator("input[value=specular]").is_checked()
+    assert not other.locator("#coloured").is_checked()
+    assert other.locator("#tint").input_value() == "#ffcc88"
+
+
+def test_a_scale_bar_if_the_size_of_a_pixel_is_known(open_page):
+    """It is as long as it says, and at most a quarter of the view."""
+    assert open_page(result_page(REPORT, *ball())).locator("#bar").count() == 0
+    report = {**REPORT, "surface": {"pixel_size_mm": 0.25}}
+    page = open_page(result_page(report, *ball()), width=800)
+    page.evaluate("splinecli.ready")
+    for zoom, text in ((1, "10 mm"), (4, "2 mm")):
+        page.evaluate(f"splinecli.show({zoom}, 128, 128)")
+        wait_until(page, f"document.getElementById('bar').textContent === '{text}'")
+        length, view = (page.locator(name).bounding_box()["width"] for name in ("#bar", "#view"))
+        assert abs(length / view - int(text.split()[0]) / (SIDE * 0.25 / zoom)) < 0.01
+
+
 TOUCH = "Input.dispatchTouchEvent"
 
 

@@ -5,16 +5,18 @@ const LIGHT_STEP = 0.05, PAN_STEP = 0.1, ZOOM_STEP = 1.25;
 const WHEEL_TO_ZOOM = 1 / 300;  // octaves a pixel of the wheel
 const LARGEST_PIXEL = 32;  // of the map, on the screen
 const STILL = 4;  // pixels that a click may move
+const WRITE_MS = 300;  // the address follows when nothing has moved for this time
 const SLOW_MS = 30, REST_MS = 400;  // drawings that take longer are hasty until nothing has moved for this time
 
 const find = (id) => document.getElementById(id);
 const PICTURES = { high: "high", low: "low", albedo: MATERIAL ? "base_colour" : "albedo", confidence: "confidence", gloss: "gloss" };
 const findMaps = (prefix) => Object.fromEntries(Object.entries(PICTURES).map(([name, id]) => [name, find(prefix + id)]));
-const [exposure, gain, shininess, ambient, coloured, doubt, hold, measure] =
-  ["exposure", "gain", "shininess", "ambient", "coloured", "doubt", "hold", "measure"].map(find);
+const SETTINGS = ["exposure", "gain", "shininess", "softness", "tint", "ambient", "coloured", "doubt"];
+const [exposure, gain, shininess, softness, tint, ambient, coloured, doubt] = SETTINGS.map(find);
+const [hold, measure, bar] = ["hold", "measure", "bar"].map(find);
 const views = [...document.querySelectorAll("input[name=view]")], ruler = find("ruler");
 const pointers = new Map();  // the fingers or the button that are down: their last places on the screen
-let canvas = find("view"), maps = findMaps("first-"), drawing = null, awaited = false, slow = true, rest = 0, wholeDrawn;
+let canvas = find("view"), maps = findMaps("first-"), drawing = null, awaited = false, slow = true, rest = 0, writing = 0, wholeDrawn;
 let light = [0, 0, 1], isWhole = false;  // whether the maps are those in full resolution
 let clicked = null, ends = null;  // where the button went down, while it did not move; the ends of the ruler on the map
 const wholeDrawing = new Promise((resolve) => { wholeDrawn = resolve; });
@@ -26,6 +28,8 @@ function region() {
   const [across, down] = [width / shown.zoom, height / shown.zoom];
   return [shown.x - across / 2, shown.y - down / 2, across, down];
 }
+
+const decodeLevel = (s) => s <= 0.04045 ? s / 12.92 : ((s + 0.055) / 1.055) ** 2.4;
 
 function redraw() {
   if (!drawing || awaited) return;
@@ -39,6 +43,7 @@ function redraw() {
 function drawNow(hasty) {
   const surface = {
     view: views.find((input) => input.checked).value, exposure: 2 ** (exposure?.value ?? 0), gain: +(gain?.value ?? 0), shininess: 2 ** shininess.value,
+    softness: +softness.value, tint: [1, 3, 5].map((at) => decodeLevel(parseInt(tint.value.slice(at, at + 2), 16) / 255)),
     ambient: +ambient.value, coloured: +Boolean(coloured?.checked), doubt: +Boolean(doubt?.checked),
   };
   const took = drawing.draw(region(), surface, hasty);
@@ -49,6 +54,9 @@ function drawNow(hasty) {
     if (isWhole) wholeDrawn();
   }
   showRuler();
+  showScale();
+  clearTimeout(writing);
+  writing = setTimeout(writeAddress, WRITE_MS);
   canvas.removeAttribute("aria-busy");
   find("loading").hidden = isWhole;
   find("loading").textContent = "Loading the full resolution\u00a0\u2026";
@@ -107,29 +115,56 @@ function showRuler() {
   [label.style.left, label.style.top] = place((x0 + x1) / 2, (y0 + y1) / 2).map((share) => `${Math.min(Math.max(share, 5), 85)}%`);
 }
 
+/** Show a bar of a round length, at most a quarter of the view, if the size of a pixel is known. */
+function showScale() {
+  if (!bar) return;
+  const across = region()[2] * canvas.dataset.unitsPerPixel, power = 10 ** Math.floor(Math.log10(across / 4));
+  const length = [5, 2, 1].find((digit) => digit * power <= across / 4) * power;
+  bar.style.width = `${100 * length / across}%`;
+  bar.textContent = `${+length.toPrecision(1)} ${canvas.dataset.unit}`;
+}
+
 function showSettings() {
-  const texts = [exposure ? [exposure, (+exposure.value).toFixed(1)] : [gain, (+gain.value).toFixed(2)], [ambient, (+ambient.value).toFixed(2)], [shininess, Math.round(2 ** shininess.value)]];
-  for (const [input, text] of texts) document.querySelector(`output[for=${input.id}]`).textContent = text;
-  const view = views.find((input) => input.checked).value;
-  if (gain) gain.disabled = view !== "shaded";  // specular enhancement has fixed shares
-  shininess.disabled = view === "normals" || (MATERIAL && view === "shaded");
-  ambient.disabled = view === "normals";
+  const texts = [[exposure, 1], [gain, 2], [softness, 2], [ambient, 2]].filter(([input]) => input)
+    .map(([input, digits]) => [input, (+input.value).toFixed(digits)]);
+  for (const [input, text] of [...texts, [shininess, Math.round(2 ** shininess.value)]])
+    document.querySelector(`output[for=${input.id}]`).textContent = text;
+  const view = views.find((input) => input.checked).value, row = (input) => input.parentElement;
+  if (gain) row(gain).hidden = view !== "shaded";  // specular enhancement has fixed shares
+  row(shininess).hidden = view === "normals" || (MATERIAL && view === "shaded");
+  for (const input of [exposure, softness, tint, ambient]) if (input) row(input).hidden = view === "normals";
   redraw();
 }
 
+/** Write what differs from the page as it opens into the address, which then opens the same view. */
+function writeAddress() {
+  const wanted = { light: light.slice(0, 2).map((value) => value.toFixed(3)).join() }, changed = (input) => input && input.value !== input.defaultValue;
+  if (wanted.light === canvas.dataset.light.split(",").map((value) => (+value).toFixed(3)).join()) delete wanted.light;
+  if (!views[0].checked) wanted.view = views.find((input) => input.checked).value;
+  for (const [name, input] of Object.entries({ exposure, specular: gain, softness, ambient })) if (changed(input)) wanted[name] = input.value;
+  if (changed(shininess)) wanted.shininess = (2 ** shininess.value).toFixed(1);
+  if (changed(tint)) wanted.colour = tint.value.slice(1);
+  if (coloured && !coloured.checked) wanted.albedo = 0;
+  if (doubt?.checked) wanted.confidence = 1;
+  if (shown.zoom > 1) wanted.zoom = [shown.zoom.toFixed(2), shown.x.toFixed(1), shown.y.toFixed(1)].join();
+  if (ends) wanted.ruler = ends.flat().map((value) => value.toFixed(1)).join();
+  const fragment = Object.entries(wanted).map((pair) => pair.join("=")).join("&");
+  if (fragment !== location.hash.slice(1)) history.replaceState(null, "", `#${fragment}`);
+}
+
 /**
- * Read the address: light=x,y view=shaded|specular|normals specular=gain exposure=stops shininess=exponent ambient=share albedo=0
- * confidence=1 zoom=factor,x,y ruler=x,y,x,y, the last two in pixels of the map. An example:
- * page.html#light=-0.7,0.5&specular=0
+ * Read the address: light=x,y view=shaded|specular|normals specular=gain exposure=stops shininess=exponent softness=share
+ * colour=rrggbb ambient=share albedo=0 confidence=1 zoom=factor,x,y ruler=x,y,x,y, the last two in pixels of the map. An
+ * example: page.html#light=-0.7,0.5&specular=0
  */
 function readAddress() {
   const wanted = new URLSearchParams(location.hash.slice(1)), numbers = (name) => wanted.get(name).split(",").map(Number);
   for (const input of views) input.checked = input.value === wanted.get("view") || (input.checked && !wanted.has("view"));
   if (!views.some((input) => input.checked)) views[0].checked = true;
-  if (wanted.has("exposure") && exposure) exposure.value = wanted.get("exposure");
-  if (wanted.has("specular") && gain) gain.value = wanted.get("specular");
+  for (const [name, input] of Object.entries({ exposure, specular: gain, softness, ambient }))
+    if (wanted.has(name) && input) input.value = wanted.get(name);
   if (wanted.has("shininess")) shininess.value = Math.log2(wanted.get("shininess"));
-  if (wanted.has("ambient")) ambient.value = wanted.get("ambient");
+  if (wanted.has("colour")) tint.value = `#${wanted.get("colour")}`;
   if (wanted.has("albedo") && coloured) coloured.checked = wanted.get("albedo") !== "0";
   if (wanted.has("confidence") && doubt) doubt.checked = wanted.get("confidence") !== "0";
   if (wanted.has("zoom")) show(...numbers("zoom"));
@@ -226,7 +261,7 @@ function start() {
   for (const type of ["pointerup", "pointercancel"]) surface.addEventListener(type, release);
   surface.addEventListener("wheel", turnWheel, { passive: false });
   surface.addEventListener("keydown", pressKey);
-  for (const input of [exposure, gain, shininess, ambient, coloured, doubt, ...views]) input?.addEventListener("input", showSettings);
+  for (const input of [...SETTINGS.map(find), ...views]) input?.addEventListener("input", showSettings);
   measure.addEventListener("input", () => {
     ends = null;
     redraw();
@@ -254,6 +289,7 @@ async function open() {
   }
   if (document.readyState === "loading") await new Promise((resolve) => addEventListener("DOMContentLoaded", resolve));
   const whole = findMaps("");
+  for (const copy of document.querySelectorAll("img[data-of]")) copy.setAttribute("src", find(copy.dataset.of).src);
   await loaded(whole);
   [maps, isWhole] = [whole, true];
   if (!drawing) start();

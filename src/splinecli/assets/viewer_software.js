@@ -31,17 +31,18 @@ function inSoftware() {
       for (let column = 0; column < columns; column++, to += 4) {
         const from = 4 * (above + Math.min(Math.floor((part[0] + (column + 0.5) / columns * part[2]) / width * across), across - 1));
         if (!(high[from] || high[from + 1] || high[from + 2])) continue;  // outside the mask
-        for (let c = 0; c < 3; c++) normal[c] = (high[from + c] * LOW_SCALE + low[from + c]) / LARGEST_CODE * 2 - 1;
+        for (let c = 0; c < 3; c++) normal[c] = (high[from + c] * LOW_SCALE + low[from + c] % LOW_SCALE) / LARGEST_CODE * 2 - 1;
         const scale = 1 / Math.hypot(...normal);
         for (let c = 0; c < 3; c++) normal[c] *= scale;
-        const cosine = Math.max(normal[0] * x + normal[1] * y + normal[2] * z, 0);
-        const peak = (Math.max(normal[0] * x + normal[1] * y + normal[2] * (z + 1), 0) / length) ** surface.shininess;
+        const cosine = Math.max((normal[0] * x + normal[1] * y + normal[2] * z + surface.softness) / (1 + surface.softness), 0);
+        const sharp = surface.shininess / (1 + surface.softness * surface.shininess / 8);
+        const peak = (Math.max(normal[0] * x + normal[1] * y + normal[2] * (z + 1), 0) / length) ** sharp;
         const doubt = confidence ? surface.doubt * STRONGEST_DOUBT * (1 - confidence[from] / 255) : 0;
         let diffuse, lobe, metal;  // of the BRDF, which the other viewer explains
         if (MATERIAL) {
           const facing = Math.max(normal[2], LEAST_Z), half = (1 + z) / 2, grazing = (half - 1) / 2;
           const aligned = Math.min(Math.max((normal[0] * x + normal[1] * y + normal[2] * z + facing) / (2 * Math.sqrt(half)), 0), 1);
-          const square = Math.max((gloss[from + 1] / 255) ** 4, 1e-4);
+          const square = Math.max(Math.min((gloss[from + 1] / 255) ** 2 + surface.softness / 2, 1) ** 2, 1e-4);
           lobe = square / (aligned * aligned * (square - 1) + 1) ** 2 * smith(cosine, square) * smith(facing, square);
           diffuse = (1 + grazing * (1 - cosine) ** 5) * (1 + grazing * (1 - facing) ** 5);
           metal = gloss[from + 2] / 255;
@@ -53,7 +54,8 @@ function inSoftware() {
           else {
             value = surface.view === "specular" ? DIFFUSE_SHARE * base * cosine + SPECULAR_SHARE * peak
               : MATERIAL ? cosine * ((base * diffuse + linear[gloss[from]] * lobe) * (1 - metal) + base * lobe * metal)
-              : (base * (1 - surface.gain) + (surface.shininess + 8) / 8 * peak * surface.gain) * cosine;
+              : (base * (1 - surface.gain) + (sharp + 8) / 8 * peak * surface.gain) * cosine;
+            value *= surface.tint[c];
             value = surface.exposure * (value + (base * (1 + normal[2]) / 2 - value) * surface.ambient);
           }
           value += (DOUBTFUL[c] - value) * doubt;

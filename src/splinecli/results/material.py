@@ -126,15 +126,16 @@ def material_warnings(facts: MaterialFacts) -> list[CaptureWarning]:
 
 PAGE_CAPTIONS = {
     "base_colour": "Base colour",
-    "gloss": "Reflectance at normal incidence (red), roughness (green) and metalness (blue)",
+    "gloss": "Roughness: white is rough",
 }
 
 
 def page_pictures(material: Float32Array) -> dict[str, Picture]:
     """Return the pictures, named in PAGE_CAPTIONS, from which the page draws a material (H, W, 7).
 
-    The base colour and the reflectance, usually 4 %, are encoded in sRGB, roughness and metalness
-    are linear.
+    The base colour and, in the red channel of `gloss`, the reflectance at normal incidence, usually
+    4 %, are encoded in sRGB. Roughness (green) and metalness (blue) are linear; the page shows each
+    of them as a gray picture.
     """
     from splinecli.materials.lobes import F0_OF_SPECULAR
 

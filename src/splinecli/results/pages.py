@@ -54,6 +54,7 @@ LONGEST_SIDE = 8192  # pixels: most devices can draw pictures up to this side le
 # below the 8 bits of a picture: 13 bits keep a normal within 0.01 degrees; more would be noise
 LOW_BITS = 5
 _LARGEST_CODE = 2 ** (8 + LOW_BITS) - 1  # represents a component of 1
+_EDGE_SIGMA = 1.2  # pixels, of the mask's blur: rounds the steps of its outline
 _TIMES = "\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}"
 
 
@@ -131,6 +132,7 @@ def result_page(
         height=height,
         light=unit(np.array(PREVIEW_LIGHT))[:2].round(4).tolist(),
         low_scale=2**LOW_BITS,
+        edge_slope=round(1 / (_EDGE_SIGMA * (2 * np.pi) ** 0.5), 3),
         largest_code=_LARGEST_CODE,
         first={name: _data_url(picture) for name, picture in first.items()},
         maps={name: _data_url(picture) for name, picture in maps.items()},
@@ -147,12 +149,21 @@ def split_normals(normals: Float32Array, mask: Bools) -> tuple[Picture, Picture]
     """Return unit normals (H, W, 3) as two RGB pictures, of upper and lower bits.
 
     They are the upper 8 bits of (n + 1) / 2, and the LOW_BITS below. The first is the usual picture
-    of a normal map. Both are black outside the mask (H, W). A pixel that is black in the first
-    picture must be outside, because no unit normal is near (-1, -1, -1). The pictures have no alpha
-    channel, because a browser would multiply the colours by it.
+    of a normal map, and is black outside the mask (H, W). A pixel that is black in it must be
+    outside, because no unit normal is near (-1, -1, -1). The upper bits of the second store the
+    blurred mask, of which no pixel crosses the level of 1/2: thin parts stay. The pictures have no
+    alpha channel, because a browser would multiply the colours by it.
     """
+    import cv2
+
     codes = np.rint((normals + 1) / 2 * _LARGEST_CODE).astype(np.uint16) * mask[..., None]
-    return (codes >> LOW_BITS).astype(np.uint8), (codes & (2**LOW_BITS - 1)).astype(np.uint8)
+    blurred = cv2.GaussianBlur(
+        mask.astype(np.float32), (0, 0), _EDGE_SIGMA, borderType=cv2.BORDER_REPLICATE
+    )
+    blurred = np.where(mask, np.maximum(blurred, 0.52), np.minimum(blurred, 0.48))
+    level = np.rint(255 * blurred).astype(np.uint16)[..., None]
+    low = (codes & (2**LOW_BITS - 1)) | ((level >> (5, 2, 0) & (7, 7, 3)) << LOW_BITS)
+    return (codes >> LOW_BITS).astype(np.uint8), low.astype(np.uint8)
 
 
 def _first_pictures(
