@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from scenes import read_image, spiral_lights, to_uint16, write_capture, write_image
+from splinecli.estimate.networks.weights import manifest
 
 
 def test_the_report_of_a_capture(run, capture):
@@ -33,6 +34,8 @@ def test_the_same_as_json(document, capture):
     # 60000 of 65535 under the light from the camera, at the top of the sphere.
     assert report["exposure"]["bright"][1] == pytest.approx(60_000 / 65_535, abs=0.01)
     assert report["warnings"] == []
+    assert report["weights"]["cnn-ps"] == manifest()["cnn-ps"]["sha256"]
+    assert len(report["weights"]) == 6
 
 
 def test_few_lights_near_the_axis(run, document, truth):

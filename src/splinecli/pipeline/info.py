@@ -1,6 +1,7 @@
 """Report on a capture: the data that `infer` would read, and the resources that it would need."""
 
 from dataclasses import replace
+from importlib import resources
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -23,7 +24,7 @@ from splinecli.recipe.steps import begin, follow, images_to_read
 from splinecli.recipe.work import Work
 from splinecli.records.capture_warnings import LIGHTS_MENDED
 from splinecli.records.output_files import CAPTURE_SHEET
-from splinecli.system.files import check_free, write_bytes
+from splinecli.system.files import check_free, file_sha256, write_bytes
 from splinecli.system.progress import SILENT, Observer
 
 # The sources of a white level, as human-readable text.
@@ -144,6 +145,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
             f" {report['expect']['seconds']} s on this machine,"
             f" {report['expect']['seconds_with_surface']} s with --surface",
         ),
+        ("weights", f"spline-net, SHA-256 {report['weights']['spline-net'][:16]}..."),
     ]
     if "mended_lights" in report:
         nothing = "not written: no other reading of the lights fits clearly better"
@@ -278,4 +280,11 @@ def _report(work: Work, n_reads: int) -> dict[str, Any]:
             # 50,000 pixels per second: integration, mesh and their files on one core
             "seconds_with_surface": round(seconds + capture.n_pixels / 50_000),
         },
+        "weights": shipped_checksums(),
     }
+
+
+def shipped_checksums() -> dict[str, str]:
+    """Return the SHA-256 of each weight file in the package, by name."""
+    with resources.as_file(resources.files("splinecli") / "assets") as folder:
+        return {path.stem: file_sha256(path) for path in sorted(folder.glob("*.safetensors"))}
