@@ -20,7 +20,7 @@ from splinecli.records.output_files import MAPS
 EXIT_STATUS = {
     "0": "Done.",
     "1": "A defect of splinecli.",
-    "2": "Usage: an option is wrong, or options contradict each other.",
+    "2": "Usage: an option is wrong, or options cannot be used together.",
     "3": "Bad input data.",
     "4": "Weights, a checkpoint or a configuration cannot be used.",
     "5": "An output cannot be written, or exists and neither --overwrite nor --update was given.",

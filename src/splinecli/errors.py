@@ -63,7 +63,7 @@ class SplinecliError(Exception):
 
 
 class UsageError(SplinecliError):
-    """The options or arguments are not valid or contradict each other (exit code 2)."""
+    """The options or arguments are not valid or cannot be used together (exit code 2)."""
 
     exit_code = 2
 

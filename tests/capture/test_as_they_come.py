@@ -199,7 +199,7 @@ REFUSED = {
     "a.lp": [
         ("", "the file is empty, expected the number of lights on the first line"),
         ("many\na.png 0 0 1", '1: found "many", expected the number of lights'),
-        (f"6\n{NAMED}", "1: the first line says 6 lights, but 12 lines follow"),
+        (f"6\n{NAMED}", "1: the first line states 6 lights, but 12 lines follow"),
         ("0\n", "1: the file contains no lights"),
         ("1\n0 0 1", '2: found "0 0 1", expected a file name and x y z'),
         ("1\na.png 0 zero 1", '2: found "zero", expected a number'),
@@ -284,7 +284,7 @@ def test_umlauts_of_older_programs_and_images_that_are_not_named(folder):
         f"schräg {number}.png" for number in NUMBERS[:4]
     ]
     assert codes(source) == ["images_left_out"]
-    assert "names 4 of the 12 images; the others were left out" in str(source.warnings[0])
+    assert "lists 4 of the 12 images; the others were left out" in str(source.warnings[0])
 
 
 @pytest.mark.parametrize(

@@ -114,7 +114,7 @@ COMMA = "A comma separates columns; write decimals with a point."
             3,
             "found a light below the horizon in column 4 (z = 0), expected z > 0",
         ),
-        ("5\n0 0 1\n0 1 1\n1 0 1\n1 1 1", 1, "the count line says 5, but 4 rows follow"),
+        ("5\n0 0 1\n0 1 1\n1 0 1\n1 1 1", 1, "the count line states 5, but 4 rows follow"),
         ("0.5\n0 0 1\n0 1 1", 1, "found 1 column, expected 3 columns or a count"),
         ("0 0 1\n0 1 1\n1 0 1", None, "found 3 light directions, expected 5, one for each image"),
         ("# nothing\n", None, "the file contains no numbers"),

@@ -184,7 +184,7 @@ def make(**changes):
 def test_positions_that_cannot_be_meant():
     for positions, message in (
         ([0, 1, -1], "light index -1 is out of range"),
-        ([0, 1, 2, 1], "light index 1 is listed twice. Name each light once."),
+        ([0, 1, 2, 1], "light index 1 is listed twice. List each light once."),
         ([0, 1], "2 lights chosen, expected at least 3."),
     ):
         with pytest.raises(UsageError, match=message):

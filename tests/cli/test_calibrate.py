@@ -215,7 +215,7 @@ def test_a_display_encoded_target_is_reported(run):
         path.unlink()
     arguments = "calibrate ball --circle 60,48,40 --gray-ball gray --overwrite"
     asked = run(f"{arguments} --transfer linear").err  # the option that the warning below names
-    assert "as --transfer says. Leave it out if" in asked and "Add --transfer" not in asked
+    assert "as --transfer requests. Leave it out if" in asked and "Add --transfer" not in asked
     intensities = []
     for curve in ("srgb", "auto"):
         run(f"{arguments} --transfer {curve}")

@@ -131,7 +131,7 @@ def test_a_mask_is_found_where_there_is_none(capture, run, document):
     run(
         f"infer {capture} --auto-mask --mask out/sphere/found_mask.png --overwrite",
         code=2,
-        says="contradict each other. Leave one out",
+        says="cannot be used together. Leave one out",
     )
     for path in capture.glob("image*.png"):
         write_image(path, np.full(mask.shape, 30_000, np.uint16))

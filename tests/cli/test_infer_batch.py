@@ -122,10 +122,10 @@ REFUSED_ARGUMENTS = """
 --white-level 0 | 2 | --white-level is '0'; expected a number above 0
 --weights spline-net | 2 | method ls uses no weights
 --maps confidence | 2 | method ls does not provide confidence
---update --overwrite | 2 | --overwrite and --update contradict each other
+--update --overwrite | 2 | --overwrite and --update cannot be used together
 --workers 0 | 2 | --workers is '0'; expected a number of at least 1, or auto
 --workers many | 2 | --workers is 'many'; expected a number of at least 1, or auto
---workers 2 --cluster tcp://a:1 | 2 | --workers and --cluster contradict each other
+--workers 2 --cluster tcp://a:1 | 2 | --workers and --cluster cannot be used together
 --shard 3/2 | 2 | --shard is 3/2; expected I/N with I from 1 to N
 --shard half | 2 | --shard is 'half'; expected I/N
 --cluster none.json | 2 | --cluster is none.json; expected an address such as tcp://scheduler:8786

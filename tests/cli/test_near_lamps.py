@@ -90,12 +90,12 @@ def test_distant_lights_despite_positions_are_warned_of(infer, near):
 
 REFUSED = """
 --light-distance 170 | 2 | --light-distance needs the size of a pixel
---light-distance 170 --light-positions l.txt | 2 | contradict each other
---pixel-size 1 --object-width 2 --light-distance 3 | 2 | contradict each other
+--light-distance 170 --light-positions l.txt | 2 | cannot be used together
+--pixel-size 1 --object-width 2 --light-distance 3 | 2 | cannot be used together
 --pixel-size -1 | 2 | --pixel-size is '-1'; expected a number above 0
 --surface --pixel-size 1e9 | 2 | the pixel size is 1e+09 mm, expected
 --pixel-size 1 | 2 | --pixel-size concerns near lamps, and bump has no light_positions.txt
---light-positions l.txt --lights l.txt | 2 | contradict each other
+--light-positions l.txt --lights l.txt | 2 | cannot be used together
 --light-positions missing.txt | 3 | missing.txt: the file does not exist
 --light-positions l.txt | 3 | the scale of the lamp positions is unknown
 --light-positions l.txt --pixel-size 1 --light-format azel | 2 | concerns light directions

@@ -210,7 +210,7 @@ def test_a_mesh_that_the_camera_cannot_see(run, cube):
     Path("back.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 3 2\n")
     result = run("prepare --mesh back.obj --size 16 --n-lights 20 -o set", code=3, out="")
     assert result.err.startswith(
-        "splinecli: back.obj: the camera sees nothing of the mesh. The camera looks along -z"
+        "splinecli: back.obj: no face of the mesh is visible to the camera. The camera looks"
     )
 
 

@@ -247,7 +247,7 @@ def test_captures_are_computed_as_they_arrive_and_only_once(
     copy = partial(shutil.copytree, capture, parts / "-first 1")
     look([*steps, copy, lambda: (parts / "-first 1/done").touch()])
     command = f"watch {parts} --marker done -- --method ls --jsonl -o out"
-    result = run(command, code=130, says="parts: the folder is there again")
+    result = run(command, code=130, says="parts: the folder is available again")
     failed, again, done = map(json.loads, result.out.splitlines())
     assert (failed["capture"], failed["exit_code"]) == ("bad", 3) and again == failed
     assert (
@@ -277,7 +277,7 @@ other | found other after the dashes, expected options of infer
 -o sphere/../sphere | the results would be among the captures
 --methd ls | no option --methd
 --method lss | no method named 'lss'
---overwrite --update | contradict each other
+--overwrite --update | cannot be used together
 """
 
 

@@ -152,7 +152,7 @@ def test_resuming_a_finished_run_says_so(run, no_pictures):
     result = run("train -o run --resume --steps 1", out="run/weights.safetensors\n")
     warning, message = result.err.splitlines()
     assert warning == f"splinecli: warning: run: {UNDONE}"
-    assert message.startswith("run: the run is at its end already.")
+    assert message.startswith("run: the run is already complete.")
     assert {path.name: path.read_bytes() for path in Path("run").iterdir()} == before
 
 
@@ -165,7 +165,7 @@ def test_a_damaged_log_is_kept_aside(run, no_pictures, damage):
     Path("run/metrics.csv").write_bytes(damaged)
     run(
         "train -o run --resume --steps 2",
-        says="splinecli: warning: metrics.csv was damaged and is now run/metrics.damaged.csv",
+        says="splinecli: warning: metrics.csv was damaged and was renamed run/metrics.damaged.csv",
     )
     assert Path("run/metrics.damaged.csv").read_bytes() == damaged
     assert steps() == ["2"]

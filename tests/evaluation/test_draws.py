@@ -109,7 +109,7 @@ def test_a_long_draw_is_read(tmp_path):
         ("0 1 2\n\n0 -1 2", ':3: found "-1", expected a light index from 0.'),
         ("0 1.5 2", ':1: found "1.5", expected a light index from 0.'),
         ("0 1 9999999999", ':1: found "9999999999", expected a light index from 0.'),
-        ("0 1 2\n4 5 4", ":2: light index 4 is listed twice. Name each light once."),
+        ("0 1 2\n4 5 4", ":2: light index 4 is listed twice. List each light once."),
         ("# two\n0 1", ":2: found 2 light indices, expected at least 3."),
         ("0 1 2\n0 1 2 3", ":2: found 4 light indices, expected 3 as in the first draw."),
         ("# nothing\n", ": the file contains no draws, expected a line of light indices for each."),

@@ -113,7 +113,7 @@ def test_what_shows_no_object_is_refused():
 def test_a_first_light_from_another_side_decides_nothing():
     true = lights()
     true[0] = (0.0, 0.6, 0.8)
-    with pytest.raises(InputError, match=r"does not come clearly from left.* --first-light 45"):
+    with pytest.raises(InputError, match=r"comes neither clearly from left.* --first-light 45"):
         find_lights(observed(true), INSIDE, True, first_light="left")
     found = find_lights(observed(true), INSIDE, True, first_light="above")
     assert mean_angle(found.directions, true) < 5

@@ -326,7 +326,7 @@ def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
             f"found 1 column, expected {expected} or a count", table.path, line=first.line
         )
     raise InputError(
-        f"the count line says {count:.0f}, but {len(following)} rows follow",
+        f"the count line states {count:.0f}, but {len(following)} rows follow",
         table.path,
         line=first.line,
         hint="Correct the count or leave it out",

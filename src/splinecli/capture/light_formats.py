@@ -50,7 +50,7 @@ def read_lp(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
         raise InputError(f'found "{count[:40]}", expected the number of lights', path, line=first)
     elif int(count[:9]) != len(rows):
         raise InputError(
-            f"the first line says {count[:40]} lights, but {len(rows)} lines follow",
+            f"the first line states {count[:40]} lights, but {len(rows)} lines follow",
             path,
             line=first,
             hint="Correct the number, or restore the missing lines",

@@ -133,8 +133,8 @@ class RadiometricCalibration:
         by = ", ".join(sorted({image.curve.by for image in images if image.curve.curve != 1}))
         if not self.automatic:
             text = (
-                f"The images say that they are display-encoded ({by}), but are read as linear, as"
-                " --transfer says."
+                f"The image files are marked as display-encoded ({by}), but are read as linear, as"
+                " --transfer requests."
             )
             text += " Leave it out if their values are not linear."
             return self, [CaptureWarning(codes.DISPLAY_ENCODED, text)] if by else []
@@ -164,7 +164,7 @@ class RadiometricCalibration:
                 if curve
                 else "sRGB"
             )
-            text = f"The images say that they are display-encoded ({by}) and are read as {how}."
+            text = f"The image files are marked as display-encoded ({by}) and are read as {how}."
             text += " Add --transfer linear if their values are linear."
             warnings.append(CaptureWarning(codes.DISPLAY_DECODED, text))
         return replace(self, curve=curve), warnings

@@ -269,7 +269,7 @@ class LampOptions:
     """The user's options for near lamps and the camera. All lengths have the same unit, such as
     millimetres.
 
-    Raises UsageError if two options contradict each other.
+    Raises UsageError if two options cannot be used together.
     """
 
     positions: str | None = None  # a file of lamp positions, which replaces the light file
@@ -284,7 +284,7 @@ class LampOptions:
         for one, other in (("positions", "distance"), ("pixel_size", "object_width")):
             if None not in (getattr(self, one), getattr(self, other)):
                 raise UsageError(
-                    f"{_OPTIONS[one]} and {_OPTIONS[other]} contradict each other",
+                    f"{_OPTIONS[one]} and {_OPTIONS[other]} cannot be used together",
                     hint="Leave one out",
                 )
         if self.distance is not None and self.pixel_size is None and self.object_width is None:

@@ -217,7 +217,7 @@ def _find_files(
     overrides = Overrides(*paths, needs_lights=options.needs_lights)
     if options.lamps.positions is not None and options.lights is not None:
         raise UsageError(
-            "--lights and --light-positions contradict each other", hint="Leave one out"
+            "--lights and --light-positions cannot be used together", hint="Leave one out"
         )
     form: RowForm = options.light_format
     near = None
@@ -333,7 +333,7 @@ def _turned_by_viewers(facts: Sequence[ImageHeader]) -> list[CaptureWarning]:
     if orientation == UPRIGHT:
         return []
     text = (
-        f"Viewers turn the images (EXIF orientation {orientation}), splinecli does not: mask,"
+        f"Viewers rotate the images (EXIF orientation {orientation}), but splinecli does not: mask,"
         " light directions and results are in the frame of the stored pixels."
     )
     return [CaptureWarning(codes.EXIF_ORIENTATION, text)]
@@ -366,7 +366,7 @@ def _read_lights(
     images, how = match_images(table, files.images)
     if len(images) < len(files.images):
         text = (
-            f"{path.name} names {len(images)} of the {len(files.images)} images; the others were"
+            f"{path.name} lists {len(images)} of the {len(files.images)} images; the others were"
             " left out."
         )
         warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))

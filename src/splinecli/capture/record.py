@@ -280,7 +280,7 @@ def check_light_indices(indices: Sequence[int], n_lights: int) -> tuple[int, ...
             problem = f"light index {index} is out of range: the capture has {n_lights} lights"
             raise UsageError(problem, hint=f"Light indices count from 0 to {n_lights - 1}")
         if index in chosen[:position]:
-            raise UsageError(f"light index {index} is listed twice", hint="Name each light once")
+            raise UsageError(f"light index {index} is listed twice", hint="List each light once")
     if len(chosen) < MIN_LIGHTS:
         raise UsageError(f"{len(chosen)} lights chosen, expected at least {MIN_LIGHTS}")
     return chosen

@@ -225,12 +225,12 @@ def _run(trainer: Trainer, messages: Messages) -> None:
             f"{names}: the set has a single scene, so training and validation use the same pixels"
         )
     if trainer.workers.leads and trainer.log.set_aside:
-        messages.warn(f"metrics.csv was damaged and is now {trainer.log.set_aside}")
+        messages.warn(f"metrics.csv was damaged and was renamed {trainer.log.set_aside}")
     shown = trainer.progress
     if shown >= 1:
         messages.say(
-            f"{trainer.folder}: the run is at its end already. Give it more --steps or --minutes"
-            " to go on."
+            f"{trainer.folder}: the run is already complete. To continue it, increase --steps or"
+            " --minutes."
         )
     with messages.progress("training", 1.0, start=shown) as advance:
 

@@ -166,7 +166,7 @@ def watch(context: Context, options: WatchOptions) -> None:
         try:
             ready = arrivals.take()
             if not is_there:
-                messages.say(f"{folder}: the folder is there again")
+                messages.say(f"{folder}: the folder is available again")
             is_there = True
         except InputError as error:  # a network drive may be away for a moment
             if is_there:

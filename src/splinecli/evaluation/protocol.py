@@ -94,7 +94,7 @@ def _read_draw(words: list[str], n_lights: int, path: Path, line: int) -> Draw:
                 f"light index {index} is listed twice",
                 path=path,
                 line=line,
-                hint="Name each light once",
+                hint="List each light once",
             )
         seen.add(index)
     if len(draw) < MIN_LIGHTS:

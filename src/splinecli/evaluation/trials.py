@@ -358,7 +358,7 @@ def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
 def scored_rows(
     capture: Capture, *, max_pixels: int | None = None, seed: int = 0
 ) -> NDArray[np.intp]:
-    """Return the rows of the observations that have ground truth, in rising order.
+    """Return the rows of the observations that have ground truth, in ascending order.
 
     With `max_pixels`, at most that many are chosen by the seed, the same for every method and
     trial. A method that uses neighbours estimates all pixels, but only these are scored. Raises

@@ -277,7 +277,7 @@ def _indices(flags: Bools) -> Integers:
 def _largest_values(
     pixels: NDArray[np.uint16], maximum: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the values of an image that are compared with its maximum, in rising order, and their
+    """Return the values of an image that are compared with its maximum, ascending, and their
     counts.
     """
     lowest_compared = math.ceil(0.5 * maximum)  # clipping cuts through a continuous range of values

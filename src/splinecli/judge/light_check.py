@@ -170,7 +170,7 @@ def _check_frame_and_order(
     names: Sequence[str],
     factors: Factors | None,
 ) -> LightCheck:
-    """Return the result of check_lights for images that do not contradict each other."""
+    """Return the result of check_lights for images that do not cannot be used together."""
     found = check_order(observations, factors, light_directions, chosen, names)
     observations = observations / found.intensities
     normals = rough_normals(observations, found.lights, mask)
@@ -384,7 +384,7 @@ def light_warnings(
         text = (
             f"Under the lights of {light_file.name}, the surface should cast shadows that are not"
             " in the images. With x and y of the lights negated, bumps become hollows, and fewer"
-            " shadows are missing. The images do not decide which is right. Compare bumps and"
+            " shadows are missing. The images do not determine which is right. Compare bumps and"
             " hollows with the object. If they are exchanged, negate x and y of the lights."
         )
         # A bump looks the same as a hollow. With this error, less than half of the normals are
@@ -407,7 +407,7 @@ def _order_words(check: LightCheck, light_file: Path) -> tuple[str, str]:
             f"The images fit {light_file.name} no better than lights in a random order (misfit"
             f" {given:.0f} % of a random order's)."
         )
-        advice = "Its lines are in another order than the images, or it belongs to another capture."
+        advice = "Its lines are not in the order of the images, or it belongs to another capture."
         return cause, advice
     advice = "Check that its lines are in the order of the images."
     if check.order == ZENITH:

@@ -138,7 +138,7 @@ def find_factors(observations: Floats, *, intensities_known: bool = True) -> Fac
 
 
 def random_misfits(factors: Factors, light_directions: Float64Array) -> Float64Array:
-    """Return the residuals of the lights (F, 3) in random orders, in rising order."""
+    """Return the residuals of the lights (F, 3) in random orders, in ascending order."""
     # A given order is compared with so many random ones.
     given = np.tile(np.arange(len(light_directions)), (250, 1))
     orders = np.random.default_rng(0).permuted(given, axis=1)

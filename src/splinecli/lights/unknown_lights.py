@@ -330,11 +330,11 @@ def _towards(directions: Float64Array, first_light: str) -> Float64Array:
     # camera axis.
     if abs(towards) < 0.15:
         problem = (
-            f"the first light does not come clearly from {first_light}, nor from the opposite side"
+            f"the first light comes neither clearly from {first_light} nor from the opposite side"
         )
         hint = (
-            "Give its azimuth in degrees, as --first-light 45, or put an image with a light from"
-            " a side first"
+            "Give its azimuth in degrees, such as --first-light 45, or begin with an image that is"
+            " lit from one side"
         )
         raise InputError(problem, hint=hint)
     return directions * OPPOSITE if towards < 0 else directions
@@ -348,7 +348,7 @@ def _check_different(observations: Float32Array) -> None:
     mean = rows.mean(axis=1, keepdims=True)
     # Images that differ by less from their mean do not show a moving light.
     if np.abs(rows - mean).mean() <= 0.01 * mean.mean():  # equal for black images
-        problem = "all images are alike, so they say nothing about the lights"
+        problem = "all images are alike, so they do not determine the lights"
         raise InputError(
             problem, hint="Photograph the object with the lamp at a different place for each image"
         )

@@ -170,9 +170,9 @@ def distil_for(
         if distilled.distillation.is_good:
             return distilled, []
     text = (
-        "The network estimated every pixel. A small one learned from a sample, but was"
-        f" {distilled.distillation.mean_deg:.1f} degrees away from it, where it expects errors of"
-        f" {distilled.distillation.expected_deg:.1f} degrees."
+        "The full network estimated every pixel, because a smaller one, trained on a sample,"
+        f" deviated from it by {distilled.distillation.mean_deg:.1f} degrees. The full network"
+        f" expects errors of {distilled.distillation.expected_deg:.1f} degrees."
     )
     return None, [CaptureWarning(NOT_DISTILLED, text)]
 

@@ -327,7 +327,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
         ):
             if self.finds_lights and given:
                 raise UsageError(
-                    f"--lights estimate {reason}, so it contradicts {name}",
+                    f"--lights estimate {reason}, so it cannot be used with {name}",
                     hint=f"Leave {name} out, or give a light file",
                 )
         add_it = "Add it, or leave both out"
@@ -335,7 +335,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
             raise UsageError("--crosstalk needs --lights-in-channels", hint=add_it)
         if self.align and self.scale is not None:
             raise UsageError(
-                "--align needs every row and column, so it contradicts --scale",
+                "--align needs every row and column, so it cannot be used with --scale",
                 hint="Leave one out, or use --crop for a first look",
             )
         if self.first_light is not None:

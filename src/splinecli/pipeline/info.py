@@ -44,7 +44,7 @@ def describe_capture(
 
     `reading` is how `infer` would read the capture; if it is strict, skipped checks are also
     warnings. Raises InputError, OutputError, or UsageError if the plot would be in the folder of
-    the images, or options contradict.
+    the images, or options cannot be used together.
     """
     reading, plot, mended_lights = reading or ReadingOptions(), options.plot, options.mended_lights
     with TemporaryDirectory() as frames:  # extracted from a video

@@ -226,9 +226,9 @@ def _find_normal_map(folder: Path) -> Path:
     except StopIteration:
         problem = f"the folder has no normal map ({', '.join(names)})"
     except UnfinishedError as error:
-        problem = f"the folder has no whole results of infer: it {error}"
+        problem = f"the folder has no complete results of infer: it {error}"
     except UNUSABLE:
-        problem = f"the folder has no whole results of infer: its {REPORT} is damaged"
+        problem = f"the folder has no complete results of infer: its {REPORT} is damaged"
     raise InputError(
         problem, path=folder, hint="Give a folder that 'splinecli infer' wrote, or one of its files"
     )
@@ -250,7 +250,7 @@ def _report_of(path: Path) -> dict[str, Any] | None:
         is_finite = 0 <= float(used["discontinuity"]) < math.inf
         if is_finite and used["convention"] in get_args(Convention):
             return report
-    problem = "is damaged, or from another version: it does not say how the normal map beside it"
+    problem = "is damaged, or from another version: it does not state how the normal map beside it"
     raise InputError(
         f"{problem} was made",
         path=path.parent / REPORT,

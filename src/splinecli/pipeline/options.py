@@ -271,7 +271,9 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
         if self.prior_detail is not None and self.prior is None:
             raise UsageError("--prior-detail needs --prior")
         if self.decimate is not None and self.pixel_aspect != 1:
-            raise UsageError("--decimate needs square pixels, so it contradicts --pixel-aspect")
+            raise UsageError(
+                "--decimate needs square pixels, so it cannot be used with --pixel-aspect"
+            )
 
     @property
     def folder(self) -> Path:
@@ -426,11 +428,14 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
                 hint="Without it, the light files of the captures are used",
             )
         if self.lights is not None and (self.refine_lights or any(self.light_noise_deg)):
-            problem = "--lights estimate uses no light file, so it contradicts --refine-lights and"
-            raise UsageError(f"{problem} --light-noise-deg", hint="Leave these out")
+            raise UsageError(
+                "--lights estimate uses no light file, so it cannot be used with --refine-lights or"
+                " --light-noise-deg",
+                hint="Leave these out",
+            )
         if self.cluster != HERE and self.jobs is not None:
             raise UsageError(
-                "--jobs contradicts --workers and --cluster",
+                "--jobs cannot be used with --workers or --cluster",
                 hint="Leave it out: a worker scores one trial at a time",
             )
         for name in self.names:

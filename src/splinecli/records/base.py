@@ -137,7 +137,7 @@ class Record(Struct, metaclass=_RecordMeta, frozen=True, kw_only=True, forbid_un
         for first, second, hint in self.CONFLICTS:
             if first in given and second in given:
                 raise UsageError(
-                    f"{titles[first]} and {titles[second]} contradict each other", hint=hint
+                    f"{titles[first]} and {titles[second]} cannot be used together", hint=hint
                 )
 
     def replace(self, **changes: Any) -> Self:
@@ -189,7 +189,7 @@ def _from_typer(kind: Any, option: Option, given: Any, title: str) -> Any:
     is_file = (is_name or isinstance(value, Path)) and not option.is_argument
     if is_file and str(value).startswith("-"):
         raise UsageError(
-            f"{title} needs a file or folder, found {value}", hint="Name it after the option"
+            f"{title} needs a file or folder, found {value}", hint="Give it after the option"
         )
     return str(value) if is_name else value
 

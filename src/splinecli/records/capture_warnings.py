@@ -173,7 +173,7 @@ IMAGES_ALIGNED = WarningKind(
 )
 IMAGES_LEFT_OUT = WarningKind(
     "images_left_out",
-    "The light file does not name all images, or some pictures have the name of a mask or map, or"
+    "The light file does not list all images, or some pictures have the name of a mask or map, or"
     " another size",
     "Check names and sizes",
 )
@@ -286,7 +286,8 @@ NONLINEARITY_SUSPECTED = fault(
 )
 NOT_DISTILLED = WarningKind(
     "not_distilled",
-    "A small network could not learn this large capture, so the computation took longer",
+    "A small network did not approximate the full one well enough on this large capture, so the"
+    " computation took longer",
     "none; `--method iw12` is faster",
 )
 PROFILE_UNREAD = WarningKind(

@@ -46,7 +46,7 @@ def test_round_trip_through_json(name):
         ({"pixels": {"cast_shadows": 1}}, "'cast_shadows' is 1; expected true or false"),
         (
             {"pixels": {"min_lights": 9, "max_lights": 8}},
-            "max_lights are 9, 10, 8; expected them in rising order",
+            "max_lights are 9, 10, 8; expected them in ascending order",
         ),
         ({"ne_net_norm": ["sum"]}, "expected 'mean' or 'sum'"),
         ({"held_share": 1.1}, "'held_share' is 1.1; expected a number from 0 to 1"),

@@ -122,7 +122,7 @@ def decode_tiff(file: BinaryIO, path: Path) -> Array | None:
         photometric = int(page.photometric)
         if photometric not in (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR):
             raise InputError(
-                f"found a TIFF of the colour model {page.photometric.name}, expected gray or RGB",
+                f"found a TIFF with the colour model {page.photometric.name}, expected gray or RGB",
                 path,
                 hint="Export it as RGB",
             )
@@ -391,7 +391,7 @@ def _libraw(path: Path) -> Iterator[ModuleType]:
         yield rawpy
     except (rawpy.LibRawError, OSError):
         raise InputError(
-            "the RAW file is damaged or of a camera that LibRaw does not know",
+            "the RAW file is damaged, or from a camera that LibRaw does not support",
             path,
             hint=f"Copy it again, or {otherwise}",
         ) from None

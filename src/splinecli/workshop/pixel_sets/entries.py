@@ -257,7 +257,7 @@ class ScenePlan:
         rendered = render_scene(scene, config, progress)
         if not rendered.mask.any():
             raise InputError(
-                "the camera sees nothing of the mesh",
+                "no face of the mesh is visible to the camera",
                 path=mesh_file or self.names[position],
                 hint="The camera looks along -z. A face is visible if its corners are"
                 " counter-clockwise as seen from the camera",

@@ -107,7 +107,7 @@ class TrainingConfig:
         if not lights.min_lights <= lights.usual_lights <= lights.max_lights:
             raise ModelError(
                 f"training settings min_lights, usual_lights, max_lights are {lights.min_lights},"
-                f" {lights.usual_lights}, {lights.max_lights}; expected them in rising order"
+                f" {lights.usual_lights}, {lights.max_lights}; expected them in ascending order"
             )
         if self.network.grid != "even":
             raise ModelError(
