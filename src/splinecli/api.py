@@ -65,21 +65,22 @@ def estimate_normals(  # noqa: PLR0913 - keyword arguments suit a notebook
             the positions of the lamps in the same unit, from the middle of the image on the
             object's mean plane.
         camera_matrix: (3, 3) in pixels, as in OpenCV, for a camera that is close relative to the
-            object's width. The light directions are then in the frame of its axis. None is an
+            object's width. The light directions are then in the frame of its axis. None assumes an
             orthographic camera.
         method: a name of `splinecli infer --method`, such as "spline-net" or "ls". See
             splinecli.estimate.methods.METHODS.
         as_stored: use the image values unchanged. By default, lens blur is removed, saturated
             observations are restored and unknown light intensities are estimated.
-        white_level: the value from which an observation is saturated, in the unit of the images.
-            None detects it for integer images; floating-point images then have no white level.
-        weights: name or file of a network's weights. None is the method's own.
-        rotations: number of rotations of the lights whose normals a network averages. None is the
-            method's own.
+        white_level: the value at and above which an observation is saturated, in the unit of the
+            images. None detects it for integer images; floating-point images then have no white
+            level.
+        weights: name or file of a network's weights. None uses the method's default.
+        rotations: number of rotations of the lights whose normals a network averages. None uses the
+            method's default.
         distil: approximate the method by a small network, trained on a sample of the pixels, for
             the remaining pixels. False uses the method on every pixel; None distils for 100,000
             pixels and more.
-        batch_size: pixels per batch. None is the method's own.
+        batch_size: pixels per batch. None uses the method's default.
         device: where to compute; "auto" is a CUDA GPU if there is one.
         precision: number format of a network; "auto" is bfloat16 where the device computes natively
             in it.
@@ -94,7 +95,7 @@ def estimate_normals(  # noqa: PLR0913 - keyword arguments suit a notebook
         capture, with the observations and with warnings that you should read.
 
     Raises:
-        splinecli.errors.UsageError: a shape, a type or an option does not fit.
+        splinecli.errors.UsageError: a shape, a type or an option is invalid.
         splinecli.errors.InputError: a value is not finite or negative, the lights cannot give
             normals (fewer than three, below the horizon, all in one plane), or the mask is empty.
         splinecli.errors.ModelError: the weights cannot be used.
@@ -165,12 +166,12 @@ def estimate_material(estimate: NormalEstimate, colours: ArrayLike | None = None
 
     Returns:
         A record of arrays for the P pixels of the mask, row by row: base_colour (P, 3), and
-        roughness, metalness, specular and confidence (P,). `is_gray` tells whether the base colour
-        is only brightness.
+        roughness, metalness, specular and confidence (P,). `is_gray` is True if the base colour
+        contains brightness alone.
 
     Raises:
         splinecli.errors.InputError: there are fewer than four lights, or a colour is not finite.
-        splinecli.errors.UsageError: the colours have another shape.
+        splinecli.errors.UsageError: the colours have the wrong shape.
 
     Examples:
         An orange matte plane under four lights:
@@ -218,7 +219,7 @@ def integrate_normals(
     *,
     discontinuity: float = 2.0,
 ) -> NDArray[np.float64]:
-    """Integrate a normal map (H, W, 3) to a height or depth map (H, W), float64, NaN outside the
+    """Integrate a normal map (H, W, 3) into a height or depth map (H, W), float64, NaN outside the
     mask.
 
     For an orthographic camera, the result is the height towards the camera in pixels. With a camera
@@ -227,20 +228,19 @@ def integrate_normals(
 
     Args:
         normal_map: unit normals in the mask, row 0 at the top; x right, y up, z to the camera.
-        mask: (H, W), True at the pixels to integrate. None takes all finite normals that are not
-            zero.
-        camera_matrix: (3, 3) in pixels, as in OpenCV. None is an orthographic camera.
+        mask: (H, W), True at the pixels to integrate. None uses all finite, non-zero normals.
+        camera_matrix: (3, 3) in pixels, as in OpenCV. None assumes an orthographic camera.
         discontinuity: sensitivity to discontinuities. 0 is least squares, which gives a continuous
             surface.
 
     Raises:
-        splinecli.errors.UsageError: the shapes or types of the arrays do not fit, or an option is
+        splinecli.errors.UsageError: the shapes or types of the arrays do not match, or an option is
         out of range.
         splinecli.errors.InputError: the mask is empty, a normal in the mask is not a unit vector,
             or the camera matrix is not valid.
 
     Examples:
-        A plane that rises by 0.75 pixels for each column:
+        A plane that rises by 0.75 pixels per column:
 
         >>> import numpy as np
         >>> import splinecli

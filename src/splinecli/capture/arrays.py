@@ -88,14 +88,14 @@ def open_arrays(
         light_directions: (F, 3), towards the lights, of any length; x right, y up, z to the camera.
             None if they have to be estimated.
         mask: (H, W), True at the pixels of the object, or numbers above half of their largest one,
-            as in a mask file. None takes all pixels.
+            as in a mask file. None uses all pixels.
         light_intensities: (F,) or (F, 3) RGB. None means that they are unknown.
         pixel_size: for near lamps, the width of a pixel on the object; light_directions are then
             positions in this unit, from the middle of the image on the object's mean plane. None
             for distant lights.
-        camera_matrix: (3, 3) in pixels, as in OpenCV. None is an orthographic camera.
-        white_level: the value from which an observation is saturated, in the unit of the images.
-            None finds it for integer images; floating-point images then have none.
+        camera_matrix: (3, 3) in pixels, as in OpenCV. None assumes an orthographic camera.
+        white_level: the value at and above which an observation is saturated, in the unit of the
+            images. None finds it for integer images; floating-point images then have none.
 
     Raises:
         UsageError: a shape or a type does not fit.

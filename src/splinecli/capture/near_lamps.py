@@ -48,7 +48,7 @@ class NearLamps:
     # (F,), the distances along each lamp's axis at which the observations' light intensities hold.
     # See `of`
     reference_distances: Float64Array
-    # (3, 3) in pixels, as in OpenCV. None is an orthographic camera
+    # (3, 3) in pixels, as in OpenCV. None assumes an orthographic camera
     camera_matrix: Float64Array | None = None
     # (P, 3), the surface in the pixels, in this unit; None if unknown
     points: Float32Array | None = None
@@ -193,8 +193,8 @@ UNIT_HINT = (
 
 
 def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> list[CaptureWarning]:
-    """Warn of implausible lamps over an object with this mask (H, W), from a file of positions, if
-    any.
+    """Warn about implausible lamps over an object with this mask (H, W), from a file of positions,
+    if any.
 
     Raises InputError if a lamp would be inside the object or hide it from the camera.
     """
@@ -243,7 +243,7 @@ def distant_lights(
 
 
 def positions_as_directions(path: Path) -> list[CaptureWarning]:
-    """Warn of a text file of light directions whose vectors have lengths as positions of lamps
+    """Warn about a text file of light directions whose vectors have lengths as positions of lamps
     have.
     """
     if is_substitution(path) or format_of(path).read != FORMATS[0].read:

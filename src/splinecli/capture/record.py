@@ -101,8 +101,8 @@ class Capture:
             None for none.
         lamps: the positions of near lamps; light_directions then hold at the origin, the middle of
             the image on the object's mean plane. None for distant lights.
-        camera_matrix: (3, 3) float64, in pixels of the mask, as in OpenCV. None is an orthographic
-            camera. Near lamps have their own.
+        camera_matrix: (3, 3) float64, in pixels of the mask, as in OpenCV. None assumes an
+            orthographic camera. Near lamps have their own.
         mended: the codes of the faults that were clear and were mended.
 
     Raises:

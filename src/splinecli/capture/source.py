@@ -73,7 +73,7 @@ class Source:
     intensities_measured: bool = True  # whether a file gives the intensities
     # the frame of the light file, in which the directions are no longer
     light_frame: LightFrame = USUAL_FRAME
-    # (3, 3) in pixels of whole images. None is an orthographic camera
+    # (3, 3) in pixels of whole images. None assumes an orthographic camera
     camera_matrix: Float64Array | None = None
 
     @property
@@ -155,7 +155,7 @@ class Source:
         raise NotImplementedError
 
     def mask_warnings(self, mask: Bools, indices: Sequence[int]) -> list[CaptureWarning]:
-        """Warn of a mask (H, W) that is probably inverted."""
+        """Warn about a mask (H, W) that is probably inverted."""
         return []
 
     def camera(self) -> Float64Array | None:
@@ -302,7 +302,7 @@ class CaptureSource(Source):
         return mask
 
     def mask_warnings(self, mask: Bools, indices: Sequence[int]) -> list[CaptureWarning]:
-        """Warn of a mask (H, W) from a file that is probably inverted. Raises InputError."""
+        """Warn about a mask (H, W) from a file that is probably inverted. Raises InputError."""
         path = self.files.mask
         if path is None or self.automatic_mask is not None or not surrounds_hole(mask):
             return []

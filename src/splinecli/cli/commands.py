@@ -25,7 +25,7 @@ def calibrate(options: CalibrateOptions) -> None:
     A BALL is a folder with one image for each light, in the order of the lights. The outline of the
     ball comes from --circle or a mask (--mask, or a file named mask in the folder). Otherwise it is
     detected in an image named ref, or in the mean of all images. The brightest spot in the ball is
-    taken as the lamp. Directions of several balls are averaged.
+    treated as the reflection of the lamp. Directions of several balls are averaged.
 
     Writes OUT/light_directions.txt for the option --lights of infer, calibration.png to check the
     result by eye, and calibration.json. With a gray ball or card, it also writes
@@ -42,11 +42,11 @@ def calibrate(options: CalibrateOptions) -> None:
 
 
 def integrate(options: IntegrateOptions) -> None:
-    """Integrate a normal map to a depth map and a mesh.
+    """Integrate a normal map into a depth map and a mesh.
 
-    Uses bilateral normal integration. The surface may break at edges, where the normals do not fit
-    together. Without a camera matrix, the depth map has heights towards the camera in pixels, with
-    mean zero. With one, it has depths along the viewing axis, of unknown scale.
+    Uses bilateral normal integration. The surface may break at edges, where the normals are
+    inconsistent. Without a camera matrix, the depth map has heights towards the camera in pixels,
+    with mean zero. With one, it has depths along the viewing axis, of unknown scale.
 
     Writes OUT/mesh.glb and mesh.ply (or .obj, .stl, .3mf), depth.npy and depth.tiff, which are NaN
     outside the object, depth.png and surface.json.
@@ -67,7 +67,7 @@ def evaluate(options: EvaluateOptions) -> int:
 
     Prints a table. Writes results.json, results.csv, table.md, table.tex and report.html to OUT,
     and a plot if you give several K or SIGMA. OUT/trials.jsonl stores finished trials: run the
-    command again to go on, or with more trials, methods or lights. A capture that cannot be scored
+    command again to continue, or to add trials, methods or lights. A capture that cannot be scored
     is skipped with a message, and the exit code is then 3.
     """
     from splinecli.pipeline.evaluate import evaluate_captures
@@ -157,7 +157,7 @@ def prepare(options: PrepareOptions) -> int:
 
 
 def import_weights(options: ImportOptions) -> None:
-    """Turn the checkpoints of the authors' SPLINE-Net (PyTorch) into a weight file.
+    """Convert the checkpoints of the authors' SPLINE-Net (PyTorch) to a weight file.
 
     Other commands take the weight file with --weights. Both checkpoints must come from the same
     training step, such as 200000-G.ckpt and 200000-D.ckpt. Only tensors are read from them; code in

@@ -335,8 +335,8 @@ def relight_first_draw(
     protocol: Protocol,
     advance: Callable[[float], object],
 ) -> RelightingReport:
-    """Return how well the material from the protocol's first draw predicts the photographs under
-    the other lights.
+    """Return how well the material estimated from the protocol's first draw predicts the
+    photographs under the other lights.
 
     `name` is the capture's in the tables, and `advance` is called with the fraction of the images
     just read. Raises UsageError if no light is left, or the lamps or the camera are near;

@@ -31,7 +31,7 @@ pixels in trials.
 """
 
 MOST_VALUES = 40_000_000
-"""Images are reduced until they have at most so many pixels together: 160 MiB."""
+"""Images are reduced until they have at most this many pixels in total: 160 MiB."""
 
 LEAST_FIT, CLEAR_FIT, MOST_UNLIKE = 0.3, 0.8, 3.0
 """An image does not fit if its correlation with its prediction from the others is below CLEAR_FIT,
@@ -77,7 +77,7 @@ _CLEARER = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """How images moved against the first one, in pixels: x is the column, y the row.
+    """How images moved relative to the first one, in pixels: x is the column, y the row.
 
     transforms: (F, 3, 3), from a pixel (x, y, 1) of the first image to the same point in each
     image. moved_pixels: (F,), the root mean square motion over the object.
@@ -92,7 +92,7 @@ class Alignment:
 
     @property
     def unexplained(self) -> int | None:
-        """The place of an image that fits the others nowhere, or None."""
+        """The index of an image that matches the others nowhere, or None."""
         worst = int(self.fits.argmin())
         if self.fits[worst] < self.least_fit:
             return worst
@@ -100,13 +100,14 @@ class Alignment:
 
     @property
     def least_fit(self) -> float:
-        """The correlation that is expected of each image."""
+        """The expected correlation of each image."""
         usual = float(np.median(self.fits))
         return LEAST_FIT if usual < LEAST_FIT else min(CLEAR_FIT, 1 - MOST_UNLIKE * (1 - usual))
 
 
 def align_images(images: Float32Array, mask: Bools, lights: Float64Array | None) -> Alignment:
-    """Return how images (F, H, W) moved against the first one, whose object is in the mask (H, W).
+    """Return how images (F, H, W) moved relative to the first one, whose object is in the mask (H,
+    W).
 
     Args:
         lights: (F, 3), towards the lights, or None if they are unknown.
@@ -229,13 +230,13 @@ class AlignedImages:
 
 
 def stride_for(n_values: int) -> int:
-    """Return by how much images with so many pixels together are reduced."""
+    """Return the factor by which images with this total number of pixels are reduced."""
     return max(1, int(np.ceil(np.sqrt(n_values / MOST_VALUES))))
 
 
 def reduced(image: Float32Array, stride: int) -> Float32Array:
-    """Return an image (H, W) with the means of squares of stride x stride pixels; the rest at the
-    borders is cut.
+    """Return an image (H, W) with the means of squares of stride x stride pixels; the remainder at
+    the borders is cropped.
     """
     height, width = (side // stride for side in image.shape)
     squares = image[: height * stride, : width * stride].reshape(height, stride, width, stride)
@@ -286,7 +287,7 @@ def _first_lights(images: Float32Array, mask: Bools, lights: Float64Array | None
 
 
 def _first_shifts(images: Float32Array, mask: Bools, lights: Float64Array) -> Float64Array:
-    """Return the shifts (F, 2) of images against the first, from correlations of images with
+    """Return the shifts (F, 2) of images relative to the first, from correlations of images with
     similar lights.
     """
     import cv2
@@ -485,7 +486,7 @@ class _Level:
     ) -> _Fit:
         """Fit the matte model robustly, with Cauchy's weights.
 
-        A residual counts in relation to the energy of its pixel's features, because most pixels
+        Residuals are weighed relative to the energy of their pixel's features, because most pixels
         have none.
         """
         raw, values = data.raw, data.values

@@ -1,4 +1,4 @@
-"""Blur by the lens and the Bayer pattern: how wide it is in the images of a capture, and
+"""Blur caused by the lens and the Bayer pattern: its width in the images of a capture, and
 observations without it.
 
 A blur of 0.7 pixels costs more accuracy than all other faults of a usual capture together, because

@@ -2,9 +2,9 @@
 
 The white level of a capture is the stored value at which its camera saturated. Cameras of 10 to 14
 bits often store their values in 16-bit files without scaling them, so that nothing ever reaches the
-file's full scale. Clipping still shows in the values. Many observations share the images' exact
-maximum, and far fewer have the values just below it. On a smooth surface without clipping, the
-maximum is no more frequent than they are.
+file's full scale. Clipping is still visible in the values. Many observations share the images'
+exact maximum, and far fewer have the values just below it. On a smooth surface without clipping,
+the maximum is no more frequent than they are.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def check_white_level(value: float | None) -> None:
 
 
 def white_level_warnings(level: WhiteLevel | None) -> list[CaptureWarning]:
-    """Warn of a white level that no file states, seen in the images."""
+    """Warn about a white level that was found in the images because no file states it."""
     if level is None or level.origin != "images":
         return []
     text = f"The images look clipped at {level.value:g}, so this value is treated as saturated."
@@ -159,7 +159,7 @@ class Saturation:
 
     @property
     def bits(self) -> int | None:
-        """The bits of a camera whose values look as if they stood in 16-bit files without scaling;
+        """The bits of a camera whose values seem to be stored in 16-bit files without scaling;
         None otherwise.
 
         Scaled values of fewer bits have common divisors.
@@ -177,8 +177,8 @@ class Saturation:
         return np.array([len(pixels) for pixels in self._decision[1]], np.int64)
 
     def choose_images(self, positions: Sequence[int]) -> Saturation:
-        """Return the white level and the saturated observations that some of the images have by
-        themselves.
+        """Return the white level and the saturated observations of some of the images, determined
+        from these images alone.
         """
         return replace(self, images=tuple(self.images[position] for position in positions))
 

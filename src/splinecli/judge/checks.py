@@ -81,7 +81,7 @@ def _explains_more(after: Evidence, before: Evidence) -> bool:
 
 
 def other_scale(seen: Evidence) -> Iterator[Finding]:
-    """Warn of an image with the values of a camera of fewer bits than the files of the others."""
+    """Warn about an image whose values have fewer bits than those of the others."""
     values, lights = np.asarray(seen.observations, np.float64), seen.directions
     # one image may be much brighter
     values = values / np.maximum(np.median(values, axis=1, keepdims=True), 1e-12)
@@ -117,7 +117,7 @@ def other_scale(seen: Evidence) -> Iterator[Finding]:
 
 
 def odd_image(seen: Evidence) -> Iterator[Finding]:
-    """Warn of an image that contradicts the others, and is not only shifted."""
+    """Warn about an image that contradicts the others, and is not only shifted."""
     for name, largest in zip(seen.names, seen.sample.observations.max(axis=0), strict=True):
         if largest <= 0:
             text = (
@@ -150,8 +150,8 @@ def odd_image(seen: Evidence) -> Iterator[Finding]:
 
 
 def _turn_by_deg(seen: Evidence, places: list[int]) -> float | None:
-    """Return by how many degrees images change the normals found from the others; None with too few
-    others.
+    """Return the angles in degrees by which images change the normals found from the others; None
+    with too few others.
     """
     others = [place for place in range(len(seen.names)) if place not in places]
     if len(others) < 3:
@@ -203,7 +203,7 @@ def same_images(seen: Evidence) -> Iterator[Finding]:
 
 
 def wrong_lights(seen: Evidence) -> Iterator[Finding]:
-    """Warn of lights in another frame or order."""
+    """Warn about lights in another frame or order."""
     check = seen.light_check
     mended = None if check.mended is None else seen.under_lights(check.mended)
     for warning, cause in light_warnings(check, seen.origin, seen.frame, seen.strict):
@@ -213,7 +213,7 @@ def wrong_lights(seen: Evidence) -> Iterator[Finding]:
 
 
 def tilted_lights(seen: Evidence) -> Iterator[Finding]:
-    """Warn of lights that are all tilted together."""
+    """Warn about lights that are all tilted together."""
     tilt, probability = seen.tilt, seen.shares.get(TILTED, 0.0)
     if seen.has_positions or tilt is None or probability < LIKELY:
         return
@@ -226,7 +226,7 @@ def tilted_lights(seen: Evidence) -> Iterator[Finding]:
 
 
 def strange_material(seen: Evidence) -> Iterator[Finding]:
-    """Warn of a material that no method knows."""
+    """Warn about a material that no method knows."""
     if seen.shares.get(TRANSLUCENT, 0.0) < LIKELY:
         return
     text = (
@@ -257,8 +257,8 @@ def rough_lights(seen: Evidence) -> Iterator[Finding]:
 
 
 def decisive_readings(seen: Evidence) -> Iterator[Finding]:
-    """Warn of images that other readings explain so much better that lights and images must belong
-    together.
+    """Warn about images that other readings explain so much better that lights and images must
+    match.
     """
     return other_readings(seen, DECISIVE, CLEAR)
 
@@ -266,7 +266,7 @@ def decisive_readings(seen: Evidence) -> Iterator[Finding]:
 def other_readings(
     seen: Evidence, largest_ratio: float = 1.0, least: float = LIKELY
 ) -> Iterator[Finding]:
-    """Warn of images that fit much better if they are read in another way; see explanations.py.
+    """Warn about images that fit much better if they are read in another way; see explanations.py.
 
     Each reading is accepted before the others are asked again. Readings that leave more than the
     largest ratio of the residual, or are less probable than `least`, are not named.
@@ -350,7 +350,7 @@ _CAUSES: dict[Kind, str] = {
 
 
 def _of_given_intensities(given: Float64Array, reading: Explanation, left: str) -> tuple[str, str]:
-    """Return in words why given intensities (F,) are wrong, and what to do."""
+    """Return the reason why given intensities (F,) are wrong, and the remedy."""
     needed = np.log(given * reading.intensities)
     ways = {
         "if they are left out": np.zeros_like(given),
@@ -374,7 +374,7 @@ def _of_given_intensities(given: Float64Array, reading: Explanation, left: str) 
 
 
 def few_lights(seen: Evidence) -> list[Finding]:
-    """Warn of fewer lights than eight, unless they are channels: one colour image has three."""
+    """Warn about fewer lights than eight, unless they are channels: one colour image has three."""
     count = len(seen.names)
     few = count < 8 and not seen.in_channels
     text = f"There are {count} lights; use 8 or more, well spread."
@@ -382,7 +382,7 @@ def few_lights(seen: Evidence) -> list[Finding]:
 
 
 def lights_near_axis(seen: Evidence) -> list[Finding]:
-    """Warn of lights that all shine from near the camera."""
+    """Warn about lights that all shine from near the camera."""
     if np.degrees(np.arccos(seen.directions[:, 2].clip(-1, 1))).max() >= 25:
         return []
     text = "All lights are within 25 degrees of the camera axis; lower lights give better normals."
@@ -390,7 +390,7 @@ def lights_near_axis(seen: Evidence) -> list[Finding]:
 
 
 def wrong_truth(seen: Evidence) -> Iterator[Finding]:
-    """Warn of a ground truth that does not fit."""
+    """Warn about a ground truth that does not fit."""
     for warning in check_ground_truth(seen.evened, seen.directions, seen.truth):
         yield Finding(warning)
 
@@ -437,7 +437,7 @@ CHECKS = [
 
 @dataclass(frozen=True, eq=False)
 class Remedy:
-    """How a capture is read once its clear faults are mended."""
+    """How a capture is read once its clear faults are corrected."""
 
     faults: tuple[Finding, ...]
     lights: Float64Array | None = None  # (F, 3); None as given
@@ -534,8 +534,8 @@ def repeated_images(observations: Floats) -> list[tuple[int, int]]:
 
 
 def check_confidence(expected_under_5: float | None) -> list[CaptureWarning]:
-    """Warn of a capture of which the network expects hardly any normal to be right; None is a
-    method without this.
+    """Warn about a capture if the network expects hardly any normal to be right; None for a method
+    without this estimate.
     """
     if expected_under_5 is None or expected_under_5 >= LEAST_EXPECTED:
         return []
@@ -555,7 +555,7 @@ def refuse_if_strict(
     mended: Collection[WarningKind] = (),
 ) -> None:
     """Raise InputError for the first warning that says that an input is probably wrong, if
-    `strict`. Faults of the kinds `mended` are mended otherwise.
+    `strict`. Otherwise, faults of the kinds `mended` are corrected.
     """
     wrong = next((warning for warning in warnings if warning.is_error), None)
     if strict and wrong is not None:

@@ -41,8 +41,8 @@ _COARSE_PIXELS = 3000
 class Evidence:
     """F images and their lights, the input of the checks.
 
-    What several checks need, such as factors, the best explanation and shifts, is computed once,
-    when it is first asked for.
+    Quantities that several checks need, such as factors, the best explanation and shifts, are
+    computed once, when they are first needed.
     """
 
     names: Sequence[str]

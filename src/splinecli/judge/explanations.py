@@ -63,7 +63,7 @@ class Explanation:
 
 
 class Doubt(NamedTuple):
-    """How likely the given reading is wrong, and the reading that is right then."""
+    """The probability that the given reading is wrong, and the reading that is then right."""
 
     reading: Explanation
     probability: float  # that any other reading is right
@@ -72,7 +72,7 @@ class Doubt(NamedTuple):
 
     @property
     def is_clear(self) -> bool:
-        """Whether it is so likely that the images are read so without being asked."""
+        """Whether it is so likely that the images are read in this way by default."""
         return self.probability > CLEAR and not self.others
 
 

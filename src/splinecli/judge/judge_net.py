@@ -1,9 +1,9 @@
 """How likely each other reading of the images is right: a small network that compares all of them.
 
-Its features are the residuals under the readings (explanations.py), and what did not decide for
-them: how well three images explain all (the factors of light_fit.py, which do not depend on the
-lights), how well the lights fit these, and the curl of the normals, each before and after the
-reading. It was trained on rendered captures of all classes of materials, right ones and faulty ones
+Its features are the residuals under the readings (explanations.py), and independent evidence: how
+well three images explain all (the factors of light_fit.py, which do not depend on the lights), how
+well the lights fit these, and the curl of the normals, each before and after the reading. It was
+trained on rendered captures of all classes of materials, right ones and faulty ones
 (benchmarks/train_judge_net.py).
 """
 
@@ -125,7 +125,7 @@ def features_of(seen: Judged) -> Float64Array | None:
 
 
 def _of_tilt(seen: Judged) -> list[float]:
-    """Return what curl and outline say of a common tilt of the lights."""
+    """Return the evidence of curl and outline about a common tilt of the lights."""
     tilt, lights = seen.tilt, seen.directions
     found = [0.0] * 4
     if tilt is not None:

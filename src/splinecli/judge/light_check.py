@@ -112,9 +112,7 @@ class LightCheck:
 
     @property
     def is_clear(self) -> bool:
-        """Whether the better reading is so much better that the lights are mended without being
-        asked.
-        """
+        """Whether the better reading is so much better that the lights are corrected by default."""
         if self.mended is None or self.residual > _METALLIC:
             return False
         better = self.order_misfit < min(0.5 * self.given_misfit, _FITS_WELL)
@@ -170,7 +168,7 @@ def _check_frame_and_order(
     names: Sequence[str],
     factors: Factors | None,
 ) -> LightCheck:
-    """Return the result of check_lights for images that do not cannot be used together."""
+    """Return the result of check_lights for images that are consistent."""
     found = check_order(observations, factors, light_directions, chosen, names)
     observations = observations / found.intensities
     normals = rough_normals(observations, found.lights, mask)
@@ -400,7 +398,7 @@ def light_warnings(
 
 
 def _order_words(check: LightCheck, light_file: Path) -> tuple[str, str]:
-    """Return in words why the order of the lights is wrong, and what to do."""
+    """Return the reason why the order of the lights is wrong, and the remedy."""
     given = 100 * check.given_misfit
     if check.order == UNKNOWN_ORDER:
         cause = (
@@ -430,7 +428,7 @@ def _order_words(check: LightCheck, light_file: Path) -> tuple[str, str]:
 def _frame_words(
     check: LightCheck, best: Candidate, frame: LightFrame, light_file: Path
 ) -> tuple[str, str]:
-    """Return in words why the frame of the lights is wrong, and what to do."""
+    """Return the reason why the frame of the lights is wrong, and the remedy."""
     pairs = (
         ("curl", best.curl, check.given.curl, ".2f"),
         ("outline", best.rim, check.given.rim, "+.2f"),

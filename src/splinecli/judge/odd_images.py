@@ -274,7 +274,7 @@ _FRAMES = [
 def check_ground_truth(
     sample: Sample, light_directions: Float64Array, truth: Floats | None
 ) -> list[CaptureWarning]:
-    """Warn of a ground truth (H, W, 3) that fits a sample under lights (F, 3) only in another
+    """Warn about a ground truth (H, W, 3) that fits a sample under lights (F, 3) only in another
     frame, or when moved.
 
     It covers the whole images: unit normals, or zero without ground truth. None gives no warning.
@@ -314,7 +314,7 @@ def check_ground_truth(
 
 
 def _shifted(normals: Float64Array, truth: Floats, sample: Sample) -> list[CaptureWarning]:
-    """Warn of a ground truth (h, w, 3) that fits normals (h, w, 3) much better when it is moved."""
+    """Warn about a ground truth (h, w, 3) that fits normals (h, w, 3) much better once moved."""
     rows, columns = np.nonzero(sample.mask)
     reach = max(1, round(0.15 * min(int(np.ptp(places)) + 1 for places in (rows, columns))))
     # Coarse to fine: the angle changes slowly with the shift.

@@ -117,8 +117,8 @@ def _plane_distance(lamps: NearLamps) -> float:
 
 
 def _camera_position(lamps: NearLamps) -> Floats:
-    """Return the camera's place (3,): the image's middle shows the origin, at the distance of the
-    mean plane.
+    """Return the camera's position (3,): the middle of the image shows the origin, at the distance
+    of the mean plane.
     """
     assert lamps.camera_matrix is not None
     row, column = lamps.middle
@@ -134,7 +134,9 @@ def _turns_to_view(views: Floats) -> Floats:
 
 
 class PixelPlaces:
-    """Rows and columns of the pixels of a mask. Two bytes a pixel, as captures may have many."""
+    """Rows and columns of the pixels of a mask. Two bytes per pixel, because captures may have
+    many.
+    """
 
     def __init__(self, mask: Bools) -> None:
         kind = np.min_scalar_type(mask.shape[1])
@@ -171,8 +173,8 @@ class IndirectLight:
         )
 
     def counts_at(self, observations: Float32Array, pixels: PixelIndices) -> Bools:
-        """Return for which of some pixels (n,) with observations (n, F) the indirect part is not
-        negligible.
+        """Return whether the indirect part is not negligible (n,) for some pixels with observations
+        (n, F).
         """
         # Indirect light up to this share of a pixel's largest observation changes mean errors by
         # 0.01 degrees at most.
@@ -239,8 +241,8 @@ def find_indirect_light(
 def _exchange(
     blocks: Blocks, covered: Float64Array, normals: Float64Array, sent: Float64Array
 ) -> Float32Array:
-    """Return the light (p, F) that arrives at each block from the others, relative to the light a
-    white one reflects.
+    """Return the light (p, F) that arrives at each block from the others, relative to the light
+    that a white block reflects.
 
     Occlusion between blocks is ignored. `covered` (p,) is the share of each block that the mask
     covers, `normals` (p, 3) are unit, and `sent` (p, F) is the radiance of each block.

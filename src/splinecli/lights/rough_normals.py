@@ -67,8 +67,8 @@ class RoughNormals:
         return float(np.median(np.abs(p_y - q_x)) / max(np.median(size), 1e-12))
 
     def least_curl_deg(self, *, mirrored: bool) -> float:
-        """Return by how many degrees, -90 to 89, to rotate the lights so that the normals have the
-        least curl.
+        """Return the angle in degrees, -90 to 89, by which to rotate the lights so that the normals
+        have the least curl.
 
         They rotate about the view axis, from x to y; if `mirrored`, their x is negated first. A
         rotation by 180 degrees more has the same curl. NaN if the mask has too few pixels.

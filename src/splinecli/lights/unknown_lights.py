@@ -105,10 +105,10 @@ def lower_lights(
     """Return low lights (F, 3), lowered together towards those under which the albedo has few
     values; others as given.
 
-    The entropy of the albedo is least (Alldrin, Mallick and Kriegman, "Resolving the generalized
-    bas-relief ambiguity by entropy minimization", CVPR 2007). Lights are only lowered, as the
-    network's errors are upwards. The observations (P, F) are linear, divided by the light
-    intensities; `error_deg` is the mean expected error.
+    The entropy of the albedo is minimised (Alldrin, Mallick and Kriegman, "Resolving the
+    generalized bas-relief ambiguity by entropy minimization", CVPR 2007). Lights are only lowered,
+    because the network's errors are upwards. The observations (P, F) are linear, divided by the
+    light intensities; `error_deg` is the mean expected error.
     """
     # The network finds lower lights too high.
     if np.degrees(np.arcsin(light_directions[:, 2].clip(-1, 1))).mean() > 55.0:
@@ -163,11 +163,11 @@ def find_lights(
     """Find the lights of the images of one object.
 
     The observations (P, F) are linear, 0 or more, and divided by the light intensities if they are
-    known; else these are found, too. The mask (H, W) has P true pixels, in row-major order.
-    `first_light` is where the light of the first observations comes from, see azimuth_of; it
-    decides between a bump and a hollow. Without it, shadows and the outline decide. Messages call
-    the first image `first_image`. If the images do not determine the lights, an error is raised, or
-    without `refuse` a guess is returned.
+    known; otherwise, these are estimated as well. The mask (H, W) has P true pixels, in row-major
+    order. `first_light` is the side that the light of the first observations comes from, see
+    azimuth_of; it decides between a bump and a hollow. Without it, shadows and the outline decide.
+    Messages call the first image `first_image`. If the images do not determine the lights, an error
+    is raised, or without `refuse` a guess is returned.
 
     Raises UsageError if the first light is neither a known side nor an azimuth; InputError if the
     images are all alike, do not show one surface, or do not determine the lights.
@@ -394,8 +394,8 @@ def _ask_network(
 def _view(
     network: LightNet, images: torch.Tensor, inside: torch.Tensor, turns: int, mirrored: bool
 ) -> LightGuess:
-    """Return the network's guess for rotated, then mirrored images, in the frame of the images as
-    they are.
+    """Return the network's guess for rotated, then mirrored images, in the frame of the original
+    images.
     """
     images, inside = torch.rot90(images, turns, (1, 2)), torch.rot90(inside, turns, (0, 1))
     if mirrored:

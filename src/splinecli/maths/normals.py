@@ -5,9 +5,9 @@ Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 
 Slopes and curvatures need no integration, so drift and tears cannot occur. For a surface z(x, y)
 with unit normals n = (-p, -q, 1) / sqrt(1 + p^2 + q^2), let J be the matrix of the derivatives of
-(nx, ny) by x and y. Its determinant is the Gaussian curvature, because normals rotate by as much as
-the surface does (Gauss), and half its trace is the mean curvature (do Carmo, Differential Geometry
-of Curves and Surfaces, 1976, 3-3).
+(nx, ny) with respect to x and y. Its determinant is the Gaussian curvature, because normals rotate
+by as much as the surface does (Gauss), and half its trace is the mean curvature (do Carmo,
+Differential Geometry of Curves and Surfaces, 1976, 3-3).
 """
 
 from dataclasses import dataclass
@@ -165,7 +165,7 @@ def curvature_of_normals(normal_map: Float32Array, mask: Bools, sigma: float = 2
 def _derivatives(
     values: Float32Array, mask: Bools, sigma: float
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the derivatives (H, W) of values by x (right) and y (up).
+    """Return the derivatives (H, W) of values with respect to x (right) and y (up).
 
     They are the slopes of a plane that is fitted to the values of the mask with Gaussian weights.
     Moments of a Gaussian are its derivatives. Inside, the slopes are the derivatives of the

@@ -99,7 +99,7 @@ class _Film(Struct):
 
 
 def _earlier(folder: Path) -> _Film:
-    """Return the record of the video whose frames are in the folder; empty without such frames."""
+    """Return the record of the video whose frames are in the folder; empty if there are none."""
     with suppress(OSError, ValueError):
         record: _Film = read_json(folder / _RECORD, _Film)
         if len(record.frames) >= FEWEST_FRAMES and all(map(_FRAME.fullmatch, record.frames)):

@@ -525,8 +525,8 @@ def _make_files(
 def _costly_maps(
     source: CaptureSource, estimate: NormalEstimate, options: InferOptions, clock: Clock
 ) -> dict[str, Float32Array]:
-    """Return the maps that need much memory or are on the page; the others are computed when they
-    are written.
+    """Return the maps that need a lot of memory or are on the page; the others are computed when
+    they are written.
     """
     made: dict[str, Float32Array] = {}
     for row in chosen_maps(options.maps, page=options.html):

@@ -110,7 +110,7 @@ def _relative(images: Sequence[ImageSummary], saturation: Saturation) -> Iterabl
 
 
 def exposure_warnings(observed: Observed, *, inverted: bool) -> list[CaptureWarning]:
-    """Warn of faults of the exposure. `inverted` is whether the mask is probably inverted."""
+    """Warn about faults of the exposure. `inverted` is whether the mask is probably inverted."""
     saturation, n_pixels = observed.saturation, observed.saturation.n_pixels
     n_images = len(observed.images)
     warnings = white_level_warnings(saturation.white_level)
@@ -141,7 +141,7 @@ def exposure_warnings(observed: Observed, *, inverted: bool) -> list[CaptureWarn
 
 
 def _eight_bits(images: Sequence[ImageSummary]) -> list[CaptureWarning]:
-    """Warn of images with 8 bits, if there are any."""
+    """Warn about images with 8 bits, if there are any."""
     if not images:
         return []
     used = max(0.01, *(image.bright for image in images))

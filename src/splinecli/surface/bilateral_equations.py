@@ -80,9 +80,9 @@ class BilateralEquations:
     ) -> tuple[Float64Array, Float64Array]:
         """Return the weights of all pairs at the heights (P,), and their flows.
 
-        The weights (E,) are half the second derivative of the sum of squares by the gap of a pair,
-        and the flows (E,) half the first derivative. Pairs along the rows come first, then those
-        along the columns.
+        The weights (E,) are half the second derivative of the sum of squares with respect to the
+        gap of a pair, and the flows (E,) half the first derivative. Pairs along the rows come
+        first, then those along the columns.
         """
         from scipy.special import expit
 
@@ -138,10 +138,11 @@ class LaplacianSolver:
     ) -> Float64Array:
         """Return the change of heights (P,) that minimises the sum of squares.
 
-        Weights (E,) are half the second derivative by the gap of each pair, and `forces` (P,) half
-        the negative first derivative by each height. `pull` (P,) is half the second derivative of
-        the cost that pulls each height to a known one; `forces` include its pull. The norm of the
-        forces that are left is at most `least`. With 0, the solution is exact to seven digits.
+        Weights (E,) are half the second derivative with respect to the gap of each pair, and
+        `forces` (P,) half the negative first derivative with respect to each height. `pull` (P,) is
+        half the second derivative of the cost that pulls each height to a known one; `forces`
+        include its pull. The norm of the remaining forces is at most `least`. With 0, the solution
+        is accurate to seven digits.
         """
         from scipy.sparse import csr_matrix, diags_array
         from scipy.sparse.linalg import cg

@@ -58,12 +58,12 @@ def integrate_normals(
 
     Args:
         normal_map: unit normals in the mask, row 0 at the top; x right, y up, z to the camera.
-        mask: (H, W), True at the pixels to integrate. None takes all finite normals that are not
-            zero.
+        mask: (H, W), True at the pixels to integrate. None uses all finite, non-zero normals.
         camera_matrix: (3, 3) in pixels, [[fx, s, cx], [0, fy, cy], [0, 0, 1]], as in OpenCV:
             columns count to the right, rows count down, and (0, 0) is the centre of the first
-            pixel. None is an orthographic camera.
-        discontinuity: how easily the surface tears at edges. 0 is least squares, which never tears.
+            pixel. None assumes an orthographic camera.
+        discontinuity: sensitivity to discontinuities. 0 is least squares, which gives a continuous
+            surface.
         prior: (H, W), a coarse surface from another source, such as a scanner: heights or depths
             like the result, NaN where it is not known. The result has its large-scale shape, its
             offset and, for depths, its scale.
@@ -72,9 +72,9 @@ def integrate_normals(
         progress: receives shares of the work, which may add up to less than 1.
 
     Raises:
-        UsageError: the shapes or types of the arrays do not fit, or an option is out of range.
+        UsageError: the shapes or types of the arrays do not match, or an option is out of range.
         InputError: the mask is empty, a normal in the mask is not a unit vector, the camera matrix
-            is not valid, or the prior has no value in the mask, or clearly another direction or
+            is not valid, or the prior has no value in the mask, or clearly has another direction or
             unit.
     """
     if not 0 <= discontinuity < inf:

@@ -77,7 +77,7 @@ def make_surface(
     """Return the surface of a normal map, and its entry in the reports.
 
     The arguments and errors are those of integrate_normals, surface_mesh and decimated_mesh. Raises
-    UsageError if settings and camera do not fit together.
+    UsageError if settings and camera do not match.
     """
     settings.check(camera_matrix)
     prior, aspect = settings.prior, settings.pixel_aspect

@@ -75,7 +75,7 @@ def _encode_glb(surface: Surface) -> bytes:
         raise no_triangles()
 
     def add_rest(buffers: Any, tree: Any) -> None:
-        """Add what trimesh lacks.
+        """Add the parts of a glTF file that trimesh cannot write.
 
         Without the tangents, viewers derive their own tangents in different ways.
         """

@@ -98,7 +98,7 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     all.
 
     It is written in the same folder and renamed. The rename replaces a link instead of following
-    it. Folders are made as needed. Raises OutputError.
+    it. Folders are created as needed. Raises OutputError.
     """
     temporary: Path | None = None
     with refusals_as_output_errors(path), made_folder(path.parent) as made:
@@ -151,8 +151,8 @@ Value = TypeVar("Value")
 def parse_json(text: str | bytes, kind: type[Value] | Any = Any) -> Value | Any:
     """Return the value of a JSON text, such as a record of this kind.
 
-    Raises ValueError, also if it is nested deeply, a number is not finite or no float can hold it,
-    or the value does not fit the kind, with its place.
+    Raises ValueError, including if it is deeply nested, a number is not finite or no float can hold
+    it, or the value does not fit the kind, with its place.
     """
 
     def whole_number(digits: str) -> int:
@@ -216,8 +216,8 @@ def refusals_as_output_errors(path: Path) -> Iterator[None]:
 
 
 def as_splinecli_error(error: OSError, path: Path | None = None) -> InputError | NoRoomError:
-    """Return our error for an OSError outside refusals_as_output_errors: usually, that a file
-    cannot be read.
+    """Return splinecli's error for an OSError outside refusals_as_output_errors, usually for a file
+    that cannot be read.
 
     `path` is named if the error does not name a file.
     """
@@ -329,7 +329,7 @@ def is_substitution(path: Path) -> bool:
 
 
 def is_folder(path: Path) -> bool:
-    """Return whether there is a folder; False also if the system refuses to answer."""
+    """Return whether there is a folder; False if the system refuses to answer."""
     return os.path.isdir(path)  # noqa: PTH112 - Path.is_dir raises for a name that is too long
 
 

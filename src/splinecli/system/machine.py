@@ -323,10 +323,10 @@ def in_order(
     threads: int = 1,
     start: Callable[[], object] | None = None,
 ) -> Iterator[_Result]:
-    """Yield function(part) of each part, in order, computed on so many threads, each of which calls
-    `start` first.
+    """Yield function(part) of each part, in order, computed on this many threads, each of which
+    calls `start` first.
 
-    At most one result more than there are threads is kept. An error is raised when its part is due.
+    At most one more result than there are threads is kept. An error is raised when its part is due.
     """
     waiting: deque[Future[_Result]] = deque()
     pool = ThreadPoolExecutor(threads, "part", start)

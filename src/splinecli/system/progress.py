@@ -103,7 +103,7 @@ class Observer:
 
     def error(self, message: str) -> None:
         """Receive an error: one of several inputs cannot be used,
-        and the work goes on without it.
+        and the work continues without it.
         """
 
     @contextmanager

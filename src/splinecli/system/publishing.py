@@ -65,7 +65,7 @@ def locked_file(path: Path, *, wait: bool = False) -> Iterator[None]:
 
 
 def _locked_file(path: Path, *, wait: bool) -> IO[str]:
-    """Return a lock file, open and locked, which is made as needed."""
+    """Return a lock file, open and locked, which is created as needed."""
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -101,7 +101,7 @@ def _locked_file(path: Path, *, wait: bool) -> IO[str]:
 
 
 def _open_lock(path: Path) -> IO[str]:
-    """Open a lock file, which is made as needed. Raises OutputError if it is not a file, but for
+    """Open a lock file, which is created as needed. Raises OutputError if it is not a file, but for
     example a pipe.
     """
     # A pipe would wait for its other end without O_NONBLOCK. A link might lead anywhere.
@@ -233,9 +233,9 @@ class NewFiles:
 def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) -> Iterator[NewFiles]:
     """Yield a collector of new files. After the block, they replace the earlier ones.
 
-    The caller must hold the folder (see held_folder). If the block fails, the earlier files stay as
-    they are. A process that ends during the replacement leaves a folder without a report. Raises
-    OutputError if a file cannot be written.
+    The caller must hold the folder (see held_folder). If the block fails, the earlier files are
+    kept unchanged. A process that ends during the replacement leaves a folder without a report.
+    Raises OutputError if a file cannot be written.
 
     `report` names the file that describes the others: removed first, written last. It is None if
     the caller ensures that no report names a file that changes. `stale` names earlier files that
@@ -252,7 +252,7 @@ def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) ->
 
 
 def refuse_link(folder: Path) -> None:
-    """Raise OutputError if a folder is really a link, which may lead anywhere."""
+    """Raise OutputError if a folder is in fact a link, which may lead anywhere."""
     if folder.is_symlink():
         raise OutputError(
             "found a link, expected a folder", folder, hint="Remove it, or choose another -o"
@@ -276,7 +276,7 @@ def _check_place(path: Path, folder: Path) -> None:
 
 
 def _remove(path: Path, folder: Path) -> None:
-    """Remove a file or a link. A folder of that name stays. Raises OutputError as _check_place
+    """Remove a file or a link. A folder of that name is kept. Raises OutputError as _check_place
     does, or OSError.
     """
     if path.parent != folder:
