@@ -84,7 +84,7 @@ def open_arrays(
 
     Args:
         images: (F, H, W) gray or (F, H, W, 3) RGB, linear. uint8 and uint16 values are scaled by
-            their full range; floating-point values are taken as they are.
+            their full range; floating-point values are not scaled.
         light_directions: (F, 3), towards the lights, of any length; x right, y up, z to the camera.
             None if they have to be estimated.
         mask: (H, W), True at the pixels of the object, or numbers above half of their largest one,
@@ -98,7 +98,7 @@ def open_arrays(
             images. None finds it for integer images; floating-point images then have none.
 
     Raises:
-        UsageError: a shape or a type does not fit.
+        UsageError: a shape or a type is invalid.
         InputError: a value is not finite or negative, or the mask is empty.
     """
     stack = _checked_images(images)
@@ -182,7 +182,7 @@ def _checked_directions(directions: ArrayLike, n_lights: int) -> Float64Array:
 
 
 def _checked_intensities(intensities: ArrayLike | None, n_lights: int) -> Float64Array:
-    """Return intensities (F, 3); ones where none are given."""
+    """Return intensities (F, 3); ones if none are given."""
     if intensities is None:
         return np.ones((n_lights, 3))
     values = np.asarray(intensities, np.float64)

@@ -88,7 +88,7 @@ def check_crosstalk(matrix: Float64Array, path: Path) -> None:
 
 def channel_lights(path: Path | None, n_images: int) -> ChannelLights:
     """Return the crosstalk of n_images colour images from a file with 3 lines, or 3 for each image;
-    None is none.
+    None without a file.
 
     Raises InputError.
     """

@@ -316,8 +316,8 @@ def find_named(folder: Path, names: Sequence[str]) -> Path | None:
 
 
 def folder_name(folder: Path) -> str:
-    """Return the folder's own name, also for ".", ".." and a trailing slash; a link's own name.
-    Raises InputError.
+    """Return the folder's own name, including for ".", ".." and a trailing slash; a link's own
+    name. Raises InputError.
     """
     path = folder.absolute()
     return (resolve(path) if ".." in path.parts else path).name or "capture"

@@ -205,7 +205,7 @@ def _own_name(folder: Path) -> str:
 
 
 def _images_folder(folder: Path) -> Path | None:
-    """Return the folder of images of a capture without images of its own; None for none."""
+    """Return the folder of images of a capture without images of its own; None if there is none."""
     inside = next((path for name in files.IMAGE_FOLDERS if is_folder(path := folder / name)), None)
     if inside is None and not files.list_images(folder) and has_lights(folder):
         others = [

@@ -30,7 +30,7 @@ _FILE = "a text file with a line {} for each image"
 
 
 class WrongCountError(InputError):
-    """A light file is for another number of images: n_found."""
+    """A light file is for a different number of images: n_found."""
 
     n_found = 0
 

@@ -90,9 +90,9 @@ PLANE_FRAMES = tuple(
 
 
 def parse_light_frame(text: str | None) -> LightFrame:
-    """Return the frame of a list such as "x-left,y-down,swap-xy"; the usual one of None.
+    """Return the frame of a list such as "x-left,y-down,swap-xy"; the usual frame for None.
 
-    Axes that the list does not name are as usual. Raises UsageError for an unknown word or a
+    Axes that are not listed have their usual direction. Raises UsageError for an unknown word or a
     repeated axis.
     """
     if text is None:

@@ -295,7 +295,9 @@ class LampOptions:
 
     @property
     def given(self) -> str | None:
-        """The first option for lamps alone that is given, as the user writes it; None for none."""
+        """The first option for lamps alone that is given, as the user writes it; None if there is
+        none.
+        """
         names = [name for name in _OPTIONS if not (name == "pixel_size" and self.scales_surface)]
         return next((_OPTIONS[name] for name in names if getattr(self, name) is not None), None)
 
@@ -311,7 +313,7 @@ NO_LAMP_OPTIONS = LampOptions()
 
 
 class Lit(Protocol):
-    """What near lamps need to know of the images that they light, such as a CaptureSource."""
+    """The properties of images that near lamps need, such as a CaptureSource."""
 
     @property
     def n_lights(self) -> int: ...

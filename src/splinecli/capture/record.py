@@ -98,7 +98,7 @@ class Capture:
         light_errors_deg: (F,) float64, the expected errors of light_directions if they were
             estimated from the images; else None.
         removed_blur: the standard deviation in pixels of the blur that was removed from the images;
-            None for none.
+            None if there is none.
         lamps: the positions of near lamps; light_directions then hold at the origin, the middle of
             the image on the object's mean plane. None for distant lights.
         camera_matrix: (3, 3) float64, in pixels of the mask, as in OpenCV. None assumes an

@@ -38,8 +38,8 @@ def correct_errors(
     was possible.
 
     It is impossible if the capture is too small, or if the correction was not made for the
-    estimator's weights. A pixel that is dark under every light stays as it is. `lighting_at` gives
-    the light of some pixels.
+    estimator's weights. A pixel that is dark under every light is left unchanged. `lighting_at`
+    returns the light of given pixels.
     """
     import torch
 
@@ -154,7 +154,7 @@ def capture_features(
     """Return the features of a capture, and its PixelScale; None if the capture shows too little.
 
     The mask (H, W) has P pixels with normals (P, 3) and errors (P, 2); see networks/li_ne_net.py.
-    Lights are (F, 3), unit; of near lamps, at the origin. `lighting_at` gives the light of some
+    Lights are (F, 3), unit; of near lamps, at the origin. `lighting_at` returns the light of given
     pixels.
     """
     n_lights = len(lights)

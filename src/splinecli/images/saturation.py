@@ -55,8 +55,8 @@ def restore_saturated(
     value, whichever is brighter. The fit is repeated on the restored values, so a saturated
     observation can only raise it. Without this, a pixel would either lose its brightest
     observations, or its normal would tilt towards the mean of the lights (figures in
-    docs/measurements.md). Pixels that are saturated under every light stay as they are. The lights
-    are unit directions (F, 3), or see LightsOf.
+    docs/measurements.md). Pixels that are saturated under every light are left unchanged. The
+    lights are unit directions (F, 3), or see LightsOf.
     """
     everywhere = np.asarray(saturated.all(axis=1))
     rows = np.flatnonzero(saturated.any(axis=1) & ~everywhere)

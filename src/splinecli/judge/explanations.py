@@ -148,7 +148,8 @@ class Explanations:
     def error_deg(self, reading: Explanation, used: Float64Array | None = None) -> float:
         """Return the median angle in degrees between a reading's normals and the given reading's.
 
-        `used` are the intensities (F,) that were estimated and are divided out; None for none.
+        `used` are the intensities (F,) that were estimated and are divided out; None if there are
+        none.
         """
         lights = self.lights if used is None else self.lights * used[:, None]
         given = self.given if used is None else _fit(self.values, self._with(lights))[0]

@@ -52,12 +52,11 @@ class Work:
 
     source: with the mask, the motion and the colours of the lamps once they are found.
     indices: the images that are used, in their order.
-    colours: (F, 3), the colours of the lamps that the source's intensities contain; None for none.
-    colours_known: whether the images were already compared to find these.
-    warnings: of the steps before the capture exists.
-    capture, saturation, images: set by the step `observations`.
-    found_intensities: (F,), estimated together with the lights, or None.
-    judgement: set by the step of this name.
+    colours: (F, 3), the colours of the lamps that the source's intensities contain; None if there
+    are none. colours_known: whether the images were already compared to find these. warnings: of
+    the steps before the capture exists. capture, saturation, images: set by the step
+    `observations`. found_intensities: (F,), estimated together with the lights, or None. judgement:
+    set by the step of this name.
     """
 
     source: Source

@@ -191,7 +191,7 @@ def first_page(file: BinaryIO, path: Path) -> Iterator[Any]:
 
 @lru_cache(maxsize=4)
 def _all_places(path: Path, *_: int) -> tuple[int, ...]:
-    """Return what _places yields. It is kept, because each page of a file is opened by itself."""
+    """Return the results of _places, kept because each page of a file is opened separately."""
     with path.open("rb") as file:
         return tuple(_places(file))
 

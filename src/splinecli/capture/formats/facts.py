@@ -2,7 +2,7 @@
 and EXIF tags.
 
 The parts before the pixels are parsed here, with limits, because Pillow reads malicious ones
-without end. Pillow reads the EXIF tags, and tifffile the tags of TIFF.
+indefinitely. Pillow reads the EXIF tags, and tifffile the tags of TIFF.
 """
 
 from __future__ import annotations
@@ -377,8 +377,8 @@ class Exposure(NamedTuple):
 
 
 def find_exposure(facts: ImageHeader) -> Exposure | None:
-    """Return the exposure of an image; None if a part of it is missing or beyond what cameras have,
-    or the file is damaged.
+    """Return the exposure of an image; None if a part of it is missing or outside the range of real
+    cameras, or the file is damaged.
     """
     try:
         if facts.exif is None and facts.kind == "RAW":

@@ -44,7 +44,7 @@ def is_film(path: Path) -> bool:
 
 
 def choose_frames(film: Path) -> tuple[int, ...]:
-    """Return the numbers, from 0 and rising, of FEWEST_FRAMES to MOST_FRAMES frames whose lights
+    """Return the ascending numbers, from 0, of FEWEST_FRAMES to MOST_FRAMES frames whose lights
     differ most.
 
     Raises InputError if the video cannot be read, or its light does not move.
@@ -74,8 +74,8 @@ def choose_frames(film: Path) -> tuple[int, ...]:
 
 
 def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
-    """Yield frames of rising numbers as stored: (H, W, 3) RGB, usually with the curve BT709. Raises
-    InputError.
+    """Yield the frames with these ascending numbers as stored: (H, W, 3) RGB, usually with the
+    curve BT709. Raises InputError.
     """
     with _opened(film) as video:
         place = 0

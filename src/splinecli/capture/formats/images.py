@@ -100,7 +100,7 @@ def _size(shape: tuple[int, ...]) -> str:
 def common_size(images: Sequence[facts.ImageHeader]) -> facts.StoredSize:
     """Return the size of the largest of some images.
 
-    Raises InputError if one has another height or width than the first, is too large, or has an
+    Raises InputError if one differs from the first in height or width, is too large, or has an
     incomplete header.
     """
     first = images[0]
@@ -274,7 +274,7 @@ def _check_jpeg(data: bytes, path: Path) -> None:
 
 
 def read_image(path: StrPath, expected: ExpectedSize | None = None) -> Float32Array:
-    """Return an image (H, W, C) float32, C 1 (gray) or 3 (RGB), whose values are taken to be
+    """Return an image (H, W, C) float32, C 1 (gray) or 3 (RGB), whose values are assumed to be
     linear.
 
     The file is PNG, TIFF or JPEG. 8- and 16-bit values are scaled so that their full scale is 1.

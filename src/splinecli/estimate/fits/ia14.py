@@ -45,7 +45,7 @@ def fit_ia14(
     zero without light and does not decrease as the observation grows.
 
     The length of n is free, so n = 0, g = 0 would be a solution. To exclude it, the mean of g over
-    the used lights is set to 1. This condition is linear, so the programme stays convex. It does
+    the used lights is set to 1. This condition is linear, so the problem remains convex. It does
     not depend on n, so it does not prefer any direction, whereas n_z = 1 would prefer the view
     direction. It also constrains g at the observed data.
 

@@ -4,7 +4,7 @@ the pixels.
 One capture has one set of lights and a few materials, so most of its pixels are redundant. Under
 near lamps, the lights change smoothly over the image. The network estimates a sample of the pixels,
 and the perceptron learns from this sample and estimates the rest over 100 times as fast. The part
-that the perceptron does not follow is mostly the network's noise (Hinton, Vinyals and Dean,
+that the perceptron does not reproduce is mostly the network's noise (Hinton, Vinyals and Dean,
 Distilling the knowledge in a neural network, arXiv 1503.02531).
 """
 

@@ -155,7 +155,7 @@ def restore_detail(
 
     All normals (3, H, W) are unit. The least squares had at least FEWEST_LIGHTS lights, and the
     noise (1, H, W) is theirs; see fits/least_squares.py. The mask (1, H, W) is 1 inside, else 0,
-    and the other maps are zero outside, as is the result. Black pixels stay as they are.
+    and the other maps are zero outside, as is the result. Black pixels are left unchanged.
     """
     mask = mask * least_squares.any(dim=0)  # black pixels carry no information
     removed, missing, noise = (

@@ -120,8 +120,8 @@ class NetworkRefiner:
         """Refine normals (P, 3) and the distributions (P, 2) of their errors in place.
 
         They are the estimator's, in the capture's frame; see networks/li_ne_net.py for the
-        distributions. A pixel that is dark under every light stays as it is. The mask (H, W) has P
-        true pixels. Only the brightness of the observations (P, F) is used here: `lighting_at`
+        distributions. A pixel that is dark under every light is left unchanged. The mask (H, W) has
+        P true pixels. Only the brightness of the observations (P, F) is used here: `lighting_at`
         gives the observations and the light directions of some pixels. For the removed blur, see
         remove_blur. `progress` is called after each tile with the number of its pixels.
         """
