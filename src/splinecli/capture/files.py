@@ -163,7 +163,7 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
             " images, and so is one .mat file with a numeric array H x W x F"
         )
         if films := list(filter(is_film, list_folder(folder))):
-            hint = f"A film is given by its own name, as in: splinecli infer {films[0]}"
+            hint = f"A video is given by its own name, as in: splinecli infer {films[0]}"
         raise NoImagesError(
             "the folder contains no images" + (f", but {found}" if found else ""),
             folder,

@@ -205,7 +205,7 @@ def _objects(values: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | 
 
 def _light_of(values: dict[str, Any]) -> list[float] | None:
     """Return the only vector of an object, or the only one called a light or direction; or x, y and
-    z, or azimuth and elevation; None for none.
+    z, or azimuth and elevation; None if there is none.
     """
     found = {key: read[0] for key, value in values.items() if (read := _vectors([value]))}
     vectors = {key: vector for key, vector in found.items() if len(vector) == 3}

@@ -47,8 +47,8 @@ def light_names() -> str:
 
 
 def find_light_file(folder: Path) -> Path | None:
-    """Return the light file in the folder; None for none. Raises InputError for several where none
-    is the usual one.
+    """Return the light file in the folder; None if there is none. Raises InputError for several
+    where none is the usual one.
     """
     for rank, group in groupby(_usual(folder), lambda found: found[0]):
         paths = [path for _, path in group if is_found_file(path)]
@@ -77,8 +77,8 @@ def search_lights(
     folder: Path, images: Sequence[Path]
 ) -> tuple[Path | None, tuple[CaptureWarning, ...]]:
     """Return the lights of a capture without a usual light file, and a warning that says which they
-    are: a light file that fits its images, or their folder if their names contain lights; None for
-    none.
+    are: a light file that fits its images, or their folder if their names contain lights; None if
+    there is none.
 
     The file is in the folder, in one called Lights inside it or beside it, or in the folder around
     it. Raises InputError if several files there fit and differ.

@@ -462,7 +462,7 @@ def _given_intensities(
     found: Float64Array | None,
 ) -> Float64Array | None:
     """Return the intensities (F, 3) as options and files give them, or else those that are found
-    with the lights; None for none.
+    with the lights; None if there is none.
     """
     if options.are_equal:
         return None

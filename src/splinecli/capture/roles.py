@@ -24,7 +24,7 @@ from splinecli.system.files import is_folder, is_found_file
 
 
 def copies(images: Sequence[Path]) -> list[CaptureWarning]:
-    """Say which images were left out because another file of the same stem shows the same
+    """Report which images were left out because another file of the same stem shows the same
     photograph.
     """
     stored = {page_of(image)[0] for image in images}
@@ -112,7 +112,7 @@ def _masks_by_name(folder: Path, images: Sequence[Path]) -> list[Path]:
 
 def find_ambient(folder: Path, images: Sequence[Path]) -> Path | None:
     """Return the image under none of the lights: the first with the usual name, or else the only
-    picture of the photographs' size with the word "ambient" in its name; None for none.
+    picture of the photographs' size with the word "ambient" in its name; None if there is none.
     """
     folders = folder, images[0].parent
     usual = find_named(folder, AMBIENT) or find_named(folders[1], AMBIENT)

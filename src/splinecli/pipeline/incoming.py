@@ -36,9 +36,9 @@ def unpacked(
     """Return the capture or, for a video, the folder in `output` with its frames.
 
     The frames are extracted if needed. `redo` decides whether the frames of an earlier video are
-    kept, replaced if the video differs, or extracted again. Raises UsageError if options are about a
-    light file, InputError if the video cannot be read, or its light does not move, or OutputError if
-    the folder contains frames from another video, or other files, or the frames cannot be
+    kept, replaced if the video differs, or extracted again. Raises UsageError if options are about
+    a light file, InputError if the video cannot be read, or its light does not move, or OutputError
+    if the folder contains frames from another video, or other files, or the frames cannot be
     written.
     """
     if not is_film(capture):

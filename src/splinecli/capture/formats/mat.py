@@ -70,7 +70,7 @@ def read_matrix(path: Path, choose: Callable[[dict[str, tuple[int, ...]]], str])
     """Return the numeric matrix of a small file whose name is chosen from the shapes by name.
 
     Vectors with numbered names, such as l1 and l2, are also a matrix, with one in each row. Only
-    the chosen matrix is expanded. Raises InputError, also those of `choose`.
+    the chosen matrix is expanded. Raises InputError, including those of `choose`.
     """
     with damage_as_input_error(path, *_DAMAGED), path.open("rb") as file:
         found = {
