@@ -94,8 +94,8 @@ def depth_error_mm(
 ) -> float:
     depth = integrate_normals(normals, mask, camera)
     known = mask & (truth > 0)
-    depth, truth = depth[known], truth[known]
-    return float(np.abs(depth * np.median(truth / depth) - truth).mean())
+    found, true = depth[known], truth[known]
+    return float(np.abs(found * np.median(true / found) - true).mean())
 
 
 def lights(setup: str) -> NDArray[np.float64]:
