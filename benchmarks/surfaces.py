@@ -100,8 +100,10 @@ def depth_error_mm(
 
 def lights(setup: str) -> NDArray[np.float64]:
     """Return the directions (F, 3) of a ring of 12, a dome of 24, or 16 handheld lights."""
+    azimuth: NDArray[np.floating]
+    zenith: NDArray[np.floating]
     if setup == "ring":
-        azimuth, zenith = np.arange(12) / 12 * 360, np.full(12, 45)
+        azimuth, zenith = np.arange(12) / 12 * 360, np.full(12, 45.0)
     elif setup == "dome":
         azimuth, zenith = np.arange(24) * 137.5, np.degrees(np.arccos(np.linspace(0.98, 0.4, 24)))
     else:  # on one side more than on the other, as by hand
