@@ -50,6 +50,7 @@ FILES = {
     " float32, in float32 for renderers. tiff and exr also write the maps below in these formats,"
     " exr depth.exr.",
     "OUT/NAME/error_map.png": "If there are true normals: angular error with a color bar.",
+    "OUT/NAME/capture.png": "Contact sheet of the images, each with its light, and of the mask.",
     "OUT/NAME/found_mask.png": "With --auto-mask: the mask of the object.",
     **{
         f"OUT/NAME/{', '.join(each.files.values())}": f"With --maps {each.name}: {each.content}."

@@ -154,7 +154,7 @@ def test_infer_medallion_runs_from_any_folder(tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("spline-net, 10 lights: MAE ")
     made = {path.name for path in (tmp_path / "here" / "medallion").iterdir()}
-    assert made == {"normals.png", "normals.npy", "error_map.png", "report.json"}
+    assert made == {"capture.png", "normals.png", "normals.npy", "error_map.png", "report.json"}
 
 
 def test_the_overview_is_what_the_script_draws(tmp_path, monkeypatch):

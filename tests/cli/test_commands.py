@@ -207,8 +207,8 @@ with Messages(quiet=False).progress("cat", 25) as advance:
 
 
 def test_messages_name_what_was_meant(run, tmp_path):
-    run("infer none --maps albedos", code=2, says="such as albedo.")
-    run("infer none --maps reliefs", code=2, says="such as relief.")
+    run("infer none --maps albedos", code=2, says="Did you mean albedo?")
+    run("infer none --maps reliefs", code=2, says="Did you mean relief?")
     result = run("watch nowhere", code=3, says="nowhere")
     assert "waiting" not in result.err
     (tmp_path / "a.txt").write_text("no normals")

@@ -62,7 +62,7 @@ def test_kills_of_every_command():
     assert "0 failed" in done.stdout
 
 
-@pytest.mark.parametrize("disk_kb", [16, 64])
+@pytest.mark.parametrize("disk_kb", [16, 128])
 def test_a_full_disk_leaves_what_was_there(folder, disk_kb):
     """The disk has room for no results; or for one set, and is filled after it."""
     mount = f"mount -t tmpfs -o size={disk_kb}k tiny disk"
@@ -70,7 +70,7 @@ def test_a_full_disk_leaves_what_was_there(folder, disk_kb):
     fill = f"{infer} && cp -r disk before && cat /dev/zero >disk/fill 2>/dev/null;"
     script = (
         f"mkdir disk; {mount} || exit 77; cp a/light_directions.txt disk/kept; "
-        f"{fill if disk_kb == 64 else ''} {infer}; echo $? >code; rm -f disk/fill; cp -r disk left"
+        f"{fill if disk_kb == 128 else ''} {infer}; echo $? >code; rm -f disk/fill; cp -r disk left"
     )
     done = shell(f"unshare --map-root-user --mount bash -c '{script}'", folder)
     if done.returncode or not (folder / "code").exists():
@@ -184,7 +184,7 @@ def test_a_limit_on_open_files(folder):
     ]
     assert len(messages) == sum(code != 0 for code in limited)
     assert "Traceback" not in done.stderr
-    assert {"normals.npy", "normals.png", "report.json"} == set(content(folder / "out" / "a"))
+    assert {"capture.png", "normals.npy", "normals.png", "report.json"} == set(content(folder / "out" / "a"))
 
 
 BUSY = (
@@ -213,8 +213,8 @@ def test_two_writers_of_one_folder(folder):
     for message, code in ended:
         assert (code, message) in ((0, message), (5, BUSY))
     assert set(content(folder / "out" / "a")) in (
-        {"normals.npy", "report.json"},
-        {"normals.tiff", "report.json"},
+        {"capture.png", "normals.npy", "report.json"},
+        {"capture.png", "normals.tiff", "report.json"},
     )
 
 

@@ -82,7 +82,7 @@ def test_the_network_expects_smaller_errors_under_lights_nearer_to_the_true_ones
     rng = np.random.default_rng(1)
     start = unit(true @ Rotation.from_euler("x", 8, degrees=True).as_matrix().T)
     start = unit(start + 0.06 * rng.normal(size=start.shape))
-    far = unit(true * (1, 1, 3))
+    far = np.roll(true, 3, axis=0)  # in a wrong order
     starts = [Lights(far, np.ones(10)), Lights(start, np.ones(10))]
     errors = np.full(10, 9.0)
     found = best_lights(images, mask, starts, start, errors, errors, intensities_known=True)
