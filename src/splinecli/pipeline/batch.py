@@ -184,7 +184,7 @@ def run_member(
         return failed(member.name, member.missing, status="missing")
     try:
         folder = unpacked(member.folder, Path(options.output), options, observer, redo=redo)
-        member = replace(member, folder=folder)
+        member, options = replace(member, folder=folder), options.with_settings(folder)
         if redo != "all":
             with held_results(member.name, options, observer) as target:
                 report = find_earlier(target, folder, options, observer.warn)

@@ -34,6 +34,7 @@ from splinecli.lights.light_fit import FEWEST_TO_REFINE
 from splinecli.maths.normals import Convention
 from splinecli.maths.robust import MIN_LIGHTS
 from splinecli.maths.transfer import AUTOMATIC, parse_transfer
+from splinecli.pipeline.folder_settings import SETTINGS, read_settings, with_settings
 from splinecli.recipe.work import RecipeOptions
 from splinecli.records import base as records
 from splinecli.records.base import (
@@ -48,6 +49,7 @@ from splinecli.records.base import (
     flag,
     option,
 )
+from splinecli.records.capture_warnings import SETTINGS_READ, CaptureWarning
 from splinecli.records.output_files import MAPS, NORMALS
 from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.surface_files import check_exr
@@ -77,6 +79,10 @@ LEAVE_ONE = "Leave one out"
 MASK_IMAGE = "Mask image, white on the {} (above half of its largest value)."
 DISCONTINUITY_HELP = "Discontinuity sensitivity of the surface; 0 gives a continuous surface."
 
+AutoMask = Annotated[
+    bool,
+    Option("Input", "If there is no mask, find the object in the images and write found_mask.png."),
+]
 AsStored = Annotated[
     bool,
     Option(
@@ -436,7 +442,25 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
                 " file",
                 hint="Add --lights estimate, or leave it out",
             )
+        taken = [
+            f"{name.replace('_', '-')} = {value}"
+            for name, value in read_settings(folder, FolderSettings).items()
+            if getattr(self, name, None) == value
+        ]
+        if taken:
+            note = CaptureWarning(SETTINGS_READ, f"{SETTINGS} sets {', '.join(taken)}.")
+            source = dataclasses.replace(source, warnings=(*source.warnings, note))
         return source
+
+    def with_settings(self, folder: Path) -> Self:
+        """Return these options, with those of splinecli.toml in the folder instead of defaults.
+
+        Raises InputError, or UsageError if options conflict.
+        """
+        merged = with_settings(self, folder, FolderSettings)
+        if merged != self:
+            merged.check_files()
+        return merged
 
     def _open(self, folder: Path, *, needs_lights: bool) -> CaptureSource:
         return open_capture(
@@ -459,6 +483,14 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
         )
 
 
+class FolderSettings(ReadingOptions, frozen=True, kw_only=True):
+    """What splinecli.toml in the folder of a capture may state: no outputs and methods."""
+
+    auto_mask: AutoMask = False
+
+    CONFLICTS = (*ReadingOptions.CONFLICTS, ("mask", "auto_mask", LEAVE_ONE))
+
+
 def parse_indices(text: str, title: str) -> tuple[int, ...]:
     """Return the integers in a text such as "0,5,12". Raises UsageError."""
     try:
@@ -477,9 +509,7 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
 
     # The defaults follow. light_indices are zero-based. map_scales are names of maps and the values
     # shown as white, if they are not those of the rows in MAPS.
-    auto_mask: bool = flag(
-        "Input", "If there is no mask, find the object in the images and write found_mask.png."
-    )
+    auto_mask: AutoMask = False
     as_stored: AsStored = False
     refine_lights: RefineLights = False
     pixel_size: Positive | None = option(
@@ -550,9 +580,8 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
     )
 
     CONFLICTS = (
-        *ReadingOptions.CONFLICTS,
+        *FolderSettings.CONFLICTS,
         ("n_lights", "light_indices", LEAVE_ONE),
-        ("mask", "auto_mask", LEAVE_ONE),
     )
 
     def __post_init__(self) -> None:

@@ -17,9 +17,10 @@ from splinecli.lights.calibration.balls import find_view
 from splinecli.pictures.capture_sheet import sheet_of
 from splinecli.pictures.plots import sky_plot
 from splinecli.pipeline.expected_seconds import expected_seconds
+from splinecli.pipeline.folder_settings import read_settings
 from splinecli.pipeline.incoming import unpacked
 from splinecli.pipeline.infer import BASE_BYTES, infer_bytes
-from splinecli.pipeline.infer_options import InfoOptions, ReadingOptions
+from splinecli.pipeline.infer_options import FolderSettings, InfoOptions, ReadingOptions
 from splinecli.recipe.steps import begin, follow, images_to_read
 from splinecli.recipe.work import Work
 from splinecli.records.capture_warnings import LIGHTS_MENDED
@@ -49,6 +50,10 @@ def describe_capture(
     reading, plot, mended_lights = reading or ReadingOptions(), options.plot, options.mended_lights
     with TemporaryDirectory() as frames:  # extracted from a video
         folder = unpacked(options.capture, Path(frames), reading, observer, redo="all")
+        auto_mask = options.auto_mask or bool(
+            reading.mask is None and read_settings(folder, FolderSettings).get("auto_mask")
+        )
+        reading = reading.with_settings(folder)
         source = reading.open(folder)
         for name, given in (
             ("--check-lights", options.check_lights),
@@ -60,7 +65,7 @@ def describe_capture(
                     hint="Give --lights FILE, or leave it out",
                 )
         _check_outputs(options, source)
-        work = begin(source, None, replace(reading.recipe, auto_mask=options.auto_mask))
+        work = begin(source, None, replace(reading.recipe, auto_mask=auto_mask))
         n_reads = images_to_read(work)
         with observer.progress("reading", n_reads) as advance:
             work = follow(work, advance=lambda amount, _: advance(amount))

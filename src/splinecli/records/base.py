@@ -185,7 +185,7 @@ def _from_typer(kind: Any, option: Option, given: Any, title: str) -> Any:
         one: Any = Annotated[number, limits(kind)]
         items = [converted(one, item, title, UsageError, strict=False) for item in _each(value)]
         value = tuple(items) if isinstance(value, tuple) else items[0]
-    is_name = PATH in _metadata(kind)
+    is_name = is_file_name(kind)
     is_file = (is_name or isinstance(value, Path)) and not option.is_argument
     if is_file and str(value).startswith("-"):
         raise UsageError(
@@ -271,6 +271,11 @@ def _metadata(kind: Any) -> Iterator[Any]:
     yield from getattr(kind, "__metadata__", ())
     for part in get_args(kind):
         yield from _metadata(part)
+
+
+def is_file_name(kind: Any) -> bool:
+    """Return whether a field of this annotation stores a path as text."""
+    return PATH in _metadata(kind)
 
 
 def plain(kind: Any) -> Any:

@@ -317,6 +317,11 @@ ROUGHNESS_UNDETERMINED = WarningKind(
     " [determine the roughness](materials.md#limits)",
     "Add lights, some of them near the camera axis",
 )
+SETTINGS_READ = WarningKind(
+    "settings_read",
+    "The file `splinecli.toml` in the folder states how the capture is read",
+    "Options on the command line take precedence",
+)
 SATURATED = WarningKind(
     "saturated", "Over 1 % of the observations are saturated", "Use a shorter exposure"
 )

@@ -1,0 +1,80 @@
+"""How a capture is read, as stated by the file splinecli.toml in its folder."""
+
+from __future__ import annotations
+
+import tomllib
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+from msgspec.structs import fields
+
+from splinecli.errors import InputError, UsageError
+from splinecli.records import base as records
+from splinecli.system.files import resolve
+
+SETTINGS = "splinecli.toml"
+CORRECT = "Correct the line, or remove it"
+OUTSIDE = "Copy the file into the folder, or name it with the option on the command line"
+Options = TypeVar("Options", bound=records.Record)
+
+
+def read_settings(folder: Path, kind: type[records.Record]) -> dict[str, Any]:
+    """Return the values of splinecli.toml in a folder, which name fields of `kind` with hyphens.
+
+    Paths in it are returned relative to the working directory. Raises InputError if the file is not
+    TOML, a name or type is wrong, or a path leaves the folder.
+    """
+    path = folder / SETTINGS
+    if not path.is_file():
+        return {}
+    kinds = {
+        name.replace("_", "-"): each
+        for name, each in records.field_types(kind).items()
+        if (option := records.option_of(each)) is not None and option.panel != "Output"
+    }
+    try:
+        text = path.read_text("utf-8")
+        given = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        hint = "Write lines such as transfer = 'srgb', or remove the file"
+        raise InputError(f"is not valid TOML: {error}", path=path, hint=hint) from None
+    found = {}
+    names = [row.partition("=")[0].strip(" \t\"'") for row in text.splitlines()]
+    for key, value in given.items():
+        line = names.index(key) + 1 if key in names else None
+        fail = partial(InputError, path=path, line=line, hint=CORRECT)
+        if key not in kinds:
+            raise fail(f"unknown setting {key!r}; known are {', '.join(sorted(kinds))}")
+        try:
+            one = records.converted(kinds[key], value, f"setting {key!r}", InputError)
+        except InputError as error:
+            raise fail(error.problem) from None
+        words = {"lights": "estimate", "intensities": "equal"}
+        if records.is_file_name(kinds[key]) and one != words.get(key):
+            if not resolve(folder / one).is_relative_to(resolve(folder)):
+                problem = f"{key} is {one!r}, which is outside the folder; expected a path inside"
+                raise fail(problem, hint=OUTSIDE)
+            one = str(folder / one)
+        found[key.replace("-", "_")] = one
+    try:
+        kind(**found)
+    except UsageError as error:
+        raise InputError(error.problem, path=path, hint=error.hint or CORRECT) from None
+    return found
+
+
+def with_settings(options: Options, folder: Path, kind: type[records.Record]) -> Options:
+    """Return the options with those of splinecli.toml in place of defaults. Raises InputError, or
+    UsageError if they conflict.
+    """
+    default = {field.name: field.default for field in fields(options)}
+    given = {name for name in default if getattr(options, name) != default[name]}
+    for pair in options.CONFLICTS:  # an option that contradicts a given one does not apply
+        given |= set(pair[:2]) if given & set(pair[:2]) else set()
+    taken = {
+        name: value
+        for name, value in read_settings(folder, kind).items()
+        if name in default and name not in given
+    }
+    return options.replace(**taken) if taken else options
