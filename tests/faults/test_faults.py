@@ -184,7 +184,9 @@ def test_a_limit_on_open_files(folder):
     ]
     assert len(messages) == sum(code != 0 for code in limited)
     assert "Traceback" not in done.stderr
-    assert {"capture.png", "normals.npy", "normals.png", "report.json"} == set(content(folder / "out" / "a"))
+    assert {"capture.png", "normals.npy", "normals.png", "report.json"} == set(
+        content(folder / "out" / "a")
+    )
 
 
 BUSY = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ from splinecli.system.files import resolve
 
 SETTINGS = "splinecli.toml"
 CORRECT = "Correct the line, or remove it"
+_WORDS = {"lights": "estimate", "intensities": "equal"}  # instead of files
 OUTSIDE = "Copy the file into the folder, or name it with the option on the command line"
 Options = TypeVar("Options", bound=records.Record)
 
@@ -50,8 +52,7 @@ def read_settings(folder: Path, kind: type[records.Record]) -> dict[str, Any]:
             one = records.converted(kinds[key], value, f"setting {key!r}", InputError)
         except InputError as error:
             raise fail(error.problem) from None
-        words = {"lights": "estimate", "intensities": "equal"}
-        if records.is_file_name(kinds[key]) and one != words.get(key):
+        if records.is_file_name(kinds[key]) and one != _WORDS.get(key):
             if not resolve(folder / one).is_relative_to(resolve(folder)):
                 problem = f"{key} is {one!r}, which is outside the folder; expected a path inside"
                 raise fail(problem, hint=OUTSIDE)
@@ -62,6 +63,25 @@ def read_settings(folder: Path, kind: type[records.Record]) -> dict[str, Any]:
     except UsageError as error:
         raise InputError(error.problem, path=path, hint=error.hint or CORRECT) from None
     return found
+
+
+def settings_text(options: records.Record, kind: type[records.Record], folder: Path) -> str:
+    """Return the file that states the options which are fields of `kind` and not the default.
+
+    Raises UsageError for a file outside the folder.
+    """
+    lines = []
+    for field in fields(kind):
+        value, key = getattr(options, field.name, field.default), field.name.replace("_", "-")
+        if value == field.default:
+            continue
+        if records.is_file_name(records.field_types(kind)[field.name]) and value != _WORDS.get(key):
+            path = resolve(Path(value))
+            if not path.is_relative_to(resolve(folder)):
+                raise UsageError(f"--{key} {value} is outside {folder}", hint=OUTSIDE)
+            value = path.relative_to(resolve(folder)).as_posix()
+        lines.append(f"{key} = {json.dumps(value)}\n")  # also TOML, of these types
+    return "".join(lines)
 
 
 def with_settings(options: Options, folder: Path, kind: type[records.Record]) -> Options:

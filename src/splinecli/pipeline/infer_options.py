@@ -770,6 +770,9 @@ class InfoOptions(Display, frozen=True, kw_only=True):
         "FILE",
     )
     plot: Path | None = option("Output", "Also plot the light directions to a PNG file.", "FILE")
+    write_settings: bool = flag(
+        "Output", "Write the options given here about reading to splinecli.toml in CAPTURE."
+    )
     output: FileName | None = option(
         "Output",
         "Write OUT/<capture name>/capture.png, a contact sheet of the images with their lights.",

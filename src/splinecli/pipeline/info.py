@@ -17,7 +17,7 @@ from splinecli.lights.calibration.balls import find_view
 from splinecli.pictures.capture_sheet import sheet_of
 from splinecli.pictures.plots import sky_plot
 from splinecli.pipeline.expected_seconds import expected_seconds
-from splinecli.pipeline.folder_settings import read_settings
+from splinecli.pipeline.folder_settings import SETTINGS, read_settings, settings_text
 from splinecli.pipeline.incoming import unpacked
 from splinecli.pipeline.infer import BASE_BYTES, infer_bytes
 from splinecli.pipeline.infer_options import FolderSettings, InfoOptions, ReadingOptions
@@ -50,21 +50,14 @@ def describe_capture(
     reading, plot, mended_lights = reading or ReadingOptions(), options.plot, options.mended_lights
     with TemporaryDirectory() as frames:  # extracted from a video
         folder = unpacked(options.capture, Path(frames), reading, observer, redo="all")
+        if options.write_settings:
+            _write_settings(options, reading, folder)
         auto_mask = options.auto_mask or bool(
             reading.mask is None and read_settings(folder, FolderSettings).get("auto_mask")
         )
         reading = reading.with_settings(folder)
         source = reading.open(folder)
-        for name, given in (
-            ("--check-lights", options.check_lights),
-            ("--mended-lights", mended_lights is not None),
-        ):
-            if given and not source.has_lights:
-                raise UsageError(
-                    f"{name} checks a light file, and the lights are estimated without one",
-                    hint="Give --lights FILE, or leave it out",
-                )
-        _check_outputs(options, source)
+        _check_options(options, source)
         work = begin(source, None, replace(reading.recipe, auto_mask=auto_mask))
         n_reads = images_to_read(work)
         with observer.progress("reading", n_reads) as advance:
@@ -195,9 +188,41 @@ def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
     ]
 
 
-def _check_outputs(options: InfoOptions, source: CaptureSource) -> None:
-    """Raise UsageError or OutputError, before the images are read, if a file cannot be written."""
+def _write_settings(options: InfoOptions, reading: ReadingOptions, folder: Path) -> None:
+    """Write splinecli.toml into the folder of a capture.
+
+    Raises UsageError if no option is given, one names a file outside the folder, or the capture is
+    a video; OutputError if another file is there.
+    """
+    if folder != options.capture:
+        raise UsageError("--write-settings needs a folder, not a video", hint="Leave it out")
+    given = {name: getattr(reading, name) for name in reading.__struct_fields__}
+    settings = FolderSettings(**given, auto_mask=options.auto_mask)
+    text = settings_text(settings, FolderSettings, folder)
+    if not text:
+        raise UsageError(
+            "--write-settings needs options to write", hint="Add them, or leave it out"
+        )
+    path = folder / SETTINGS
+    if not (path.is_file() and path.read_text("utf-8") == text):
+        check_free(folder, [SETTINGS], overwrite=options.overwrite)
+        write_bytes(path, text.encode())
+
+
+def _check_options(options: InfoOptions, source: CaptureSource) -> None:
+    """Raise UsageError or OutputError, before the images are read, if there is no light file to
+    check, or a file cannot be written.
+    """
     plot, mended_lights = options.plot, options.mended_lights
+    for name, given in (
+        ("--check-lights", options.check_lights),
+        ("--mended-lights", mended_lights is not None),
+    ):
+        if given and not source.has_lights:
+            raise UsageError(
+                f"{name} checks a light file, and the lights are estimated without one",
+                hint="Give --lights FILE, or leave it out",
+            )
     if plot is not None:
         if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
             problem = (

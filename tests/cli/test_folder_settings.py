@@ -1,0 +1,62 @@
+"""splinecli.toml in the folder of a capture."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scenes import codes
+
+
+@pytest.fixture
+def unusual(capture):
+    """A capture whose lights have another name and another frame."""
+    lights = np.loadtxt(capture / "light_directions.txt")
+    np.savetxt(capture / "lamps.dat", lights * (1, -1, 1))
+    (capture / "light_directions.txt").unlink()
+    return capture
+
+
+def test_written_settings_are_read(unusual, run, document):
+    given = f"--lights {unusual}/lamps.dat --light-frame y-down"
+    expected = document(f"infer {unusual} {given} --method ls")
+    run(f"info {unusual} {given} --write-settings")
+    text = (unusual / "splinecli.toml").read_text()
+    assert text == 'lights = "lamps.dat"\nlight-frame = "y-down"\n'
+    run(f"info {unusual} {given} --write-settings")  # the same again
+    run(f"info {unusual} --align {given} --write-settings", code=5, says="splinecli.toml")
+    found = document(f"infer {unusual} --method ls -o again")
+    assert found["light_directions"] == expected["light_directions"]
+    assert "settings_read" in codes(found) and "settings_read" not in codes(expected)
+    assert "splinecli.toml sets" in run(f"info {unusual}").err
+    run(f"infer {unusual} --method ls -o again", says="already done")
+    # The command line wins.
+    other = document(f"infer {unusual} --light-frame x-left --as-stored --method ls -o other")
+    assert other["light_directions"] != expected["light_directions"]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("transfer = ", "is not valid TOML"),
+        ("a = 1\n", ("toml:1:", "unknown setting 'a'", "light-frame")),
+        ("\nwhite-level = 'high'", ("toml:2:", "white-level")),
+        ("output = 'x'", "unknown setting 'output'"),
+        ("lights = '../lights.txt'", "outside the folder"),
+        ("light-frame = 'z-up'", "z-up"),
+    ],
+)
+def test_wrong_settings(capture, run, text, says):
+    (capture / "splinecli.toml").write_text(text)
+    for command in ("infer", "info"):
+        run(f"{command} {capture}", code=3, says=("splinecli.toml", *np.atleast_1d(says)))
+    assert not Path("out").exists()
+
+
+def test_settings_that_cannot_be_written(unusual, run):
+    run(f"info {unusual} --lights lamps.txt --write-settings", code=2, says="outside")
+    Path("unusual").mkdir()
+    given = f"--lights {unusual}/lamps.dat"
+    run(f"info {unusual} --write-settings", code=2, says="needs options")
+    assert not (unusual / "splinecli.toml").exists()
+    run(f"info {unusual} {given} --light-frame y-down --write-settings")
