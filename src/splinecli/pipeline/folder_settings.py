@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from msgspec.structs import fields
 
+from splinecli.capture.files import find_named
 from splinecli.errors import InputError, UsageError
 from splinecli.records import base as records
 from splinecli.system.files import resolve
@@ -25,10 +26,10 @@ def read_settings(folder: Path, kind: type[records.Record]) -> dict[str, Any]:
     """Return the values of splinecli.toml in a folder, which name fields of `kind` with hyphens.
 
     Paths in it are returned relative to the working directory. Raises InputError if the file is not
-    TOML, a name or type is wrong, or a path leaves the folder.
+    TOML, a name or type is wrong, a path leaves the folder, or the folder cannot be read.
     """
-    path = folder / SETTINGS
-    if not path.is_file():
+    path = find_named(folder, [SETTINGS])
+    if path is None:
         return {}
     kinds = {
         name.replace("_", "-"): each
