@@ -2,8 +2,8 @@
 
     python benchmarks/refinement_pilots.py draw CAPTURES SET... --count 600
     python benchmarks/refinement_pilots.py draw UNSEEN SET... --count 120 --seed 1
-    python benchmarks/refinement_pilots.py train CAPTURES UNSEEN RUN --variant wide --core-seconds
-    7200 python benchmarks/refinement_pilots.py report RUN...
+    python benchmarks/refinement_pilots.py train CAPTURES UNSEEN RUN --variant wide
+    python benchmarks/refinement_pilots.py report RUN...
 
 `draw` photographs scenes and stores the features of the nets, half of the cost of training. `train`
 continues the shipped nets. Both continue after an interruption. `report` prints the errors on the
@@ -26,8 +26,10 @@ import torch
 from torch import Tensor
 
 from splinecli.estimate.networks.config import NetworkConfig
+from splinecli.estimate.networks.refine_net import split_features
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import resolve_weights
+from splinecli.maths.normals import angle_between_deg
 from splinecli.workshop.pixel_sets.store import open_pixel_set
 from splinecli.workshop.synthesis import stream_seed
 from splinecli.workshop.training.config import PRESETS
@@ -51,13 +53,15 @@ RATE = 2e-4
 SAVE_SECONDS, VALIDATE_SECONDS = 60, 600
 
 
-def draw(folder: Path, sets: Sequence[Path], count: int, seed: int) -> None:
-    """Store the captures that the folder does not have."""
+def draw(folder: Path, sets: Sequence[Path], count: int, seed: int, weights: str) -> None:
+    """Store the captures that the folder does not have, after the pixelwise networks of some
+    weights.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     missing = [number for number in range(count) if not (folder / f"{number:05}.npz").exists()]
     opened = [open_pixel_set(path) for path in sets]
     scenes = [(found, found.entries, float(len(found.entries))) for found in opened]
-    network = resolve_weights("spline-net").network
+    network = resolve_weights(weights).network
     for number in missing:
         pool = ScenePool(scenes, network, PRESETS["refine"].pixels, seed, first=number)
         pool.add()
@@ -67,6 +71,8 @@ def draw(folder: Path, sets: Sequence[Path], count: int, seed: int) -> None:
         )
         new.replace(folder / f"{number:05}.npz")
         print(number, flush=True)
+    found = [pixelwise_error_deg(capture) for capture in load(folder)]
+    print(f"{len(found)} captures, {np.mean(found):.3f} deg before refinement")
 
 
 def load(folder: Path) -> list[SceneMaps]:
@@ -83,6 +89,13 @@ def sharpness(capture: SceneMaps) -> float:
     normals, known = capture.normals.float(), capture.normals.any(dim=0)
     both = known[:, 1:] & known[:, :-1]
     return float(normals.diff(dim=2).norm(dim=0)[both].mean()) if both.any() else 0.0
+
+
+def pixelwise_error_deg(capture: SceneMaps) -> float:
+    """Return the mean error of the pixelwise networks."""
+    known = capture.normals.any(dim=0)
+    normals = split_features(capture.features[None].float())[0][0, :, known].T.numpy()
+    return float(angle_between_deg(normals, capture.normals[:, known].T.float().numpy()).mean())
 
 
 @torch.no_grad()
@@ -203,6 +216,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     drawing.add_argument("sets", type=Path, nargs="+")
     drawing.add_argument("--count", type=int, default=600)
     drawing.add_argument("--seed", type=int, default=0)
+    drawing.add_argument("--weights", default="spline-net")
     training = commands.add_parser("train")
     for name in ("captures", "unseen", "run"):
         training.add_argument(name, type=Path)
