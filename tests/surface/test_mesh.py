@@ -11,7 +11,7 @@ from splinecli.errors import UsageError
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.pixel_grid import Blocks
 from splinecli.surface import mesh as mesh_module
-from splinecli.surface.mesh import Textures, decimated_mesh, surface_mesh
+from splinecli.surface.mesh import Textures, decimated_mesh, surface_mesh, with_smooth_outline
 from splinecli.surface.surface_files import Surface, encode_surface
 
 CAMERA = np.array([[100.0, 0.0, 9.0], [0.0, 110.0, 7.0], [0.0, 0.0, 1.0]])
@@ -68,6 +68,27 @@ def test_perspective_vertices_project_into_their_pixels():
     assert_allclose(image[:, 2], depth[mask], rtol=1e-6)
     towards_camera = -mesh.vertices[mesh.triangles].mean(axis=1)
     assert ((face_normals(mesh) * towards_camera).sum(axis=1) > 0).all()
+
+
+def test_the_outline_of_a_disc_is_round():
+    rows, columns = np.mgrid[-45:46, -45:46]
+    mask = np.hypot(rows, columns) < 40.3
+    height = 0.01 * (rows**2 + columns**2)
+
+    def radii(mesh):
+        radius, turn = np.hypot(*mesh.vertices[:, :2].T), np.arctan2(*mesh.vertices[:, :2].T)
+        assert_allclose(mesh.vertices[:, 2], 0.01 * radius**2, atol=0.15)
+        assert_array_equal(np.sign(face_normals(mesh)[:, 2]), 1)
+        # The outermost vertex in each of 90 sectors
+        return np.array(
+            [radius[(turn * 45 / np.pi).astype(int) == n].max() for n in range(-44, 45)]
+        )
+
+    plain = surface_mesh(height, mask)
+    smooth = with_smooth_outline(plain)
+    assert radii(smooth).std() < radii(plain).std() / 2
+    assert abs(radii(smooth).mean() - radii(plain).mean()) < 0.5
+    assert_allclose(smooth.vertices[:, 0] / 91 + 0.5, smooth.uvs[:, 0], atol=1e-6)
 
 
 @pytest.mark.parametrize("camera", [None, CAMERA])

@@ -188,6 +188,8 @@ def _triangles(heights: Float64Array, mask: Bools) -> NDArray[np.int32]:
 
 # pixels above which a map's triangles are too many, so the triangles of its blocks are decimated
 LARGE_MAP = 500_000
+# A border is smoothed over about this many vertices on either side.
+_OUTLINE_ROUNDS = 4
 # barycentric coordinate down to which a pixel is inside, so that none is lost between triangles
 _OUTSIDE = 1e-6
 
@@ -203,9 +205,9 @@ def decimated_mesh(
 ) -> SurfaceMesh:
     """Return a mesh of about `n_triangles` triangles, with a texture of the normals.
 
-    Edges are collapsed where this moves the surface least (Garland and Heckbert, Surface
-    simplification using quadric error metrics, SIGGRAPH 1997). A mesh that has no more triangles is
-    returned as it is.
+    The outline is smoothed, and edges are collapsed where this moves the surface least (Garland and
+    Heckbert, Surface simplification using quadric error metrics, SIGGRAPH 1997). A mesh that has no
+    more triangles is returned as it is.
 
     Args:
         depth, mask, camera_matrix, largest_step: see surface_mesh.
@@ -229,6 +231,7 @@ def decimated_mesh(
         )
     if n_triangles >= len(mesh.triangles):
         return mesh
+    mesh = with_smooth_outline(mesh)
     simplify = import_extra("fast_simplification", "mesh").simplify
     # The thresholds of the library are lengths: give it pixels.
     pixel = 1 if camera_matrix is None else 1 / focal_length(camera_matrix)
@@ -251,6 +254,26 @@ def decimated_mesh(
         tangents=tangents.astype(np.float32),
         normal_texture=_normal_texture(points, triangles, normals, tangents, normal_map),
     )
+
+
+def with_smooth_outline(mesh: SurfaceMesh) -> SurfaceMesh:
+    """Return a mesh of pixels whose border does not have the steps of single pixels.
+
+    The vertices of the border are smoothed along it, except where two borders meet.
+    """
+    count = len(mesh.vertices)
+    start = mesh.triangles.ravel().astype(np.int64)
+    end = np.roll(mesh.triangles, -1, axis=1).ravel().astype(np.int64)
+    border = ~np.isin(start * count + end, end * count + start)
+    start, end = start[border], end[border]
+    once = (np.bincount(start, minlength=count) == 1) & (np.bincount(end, minlength=count) == 1)
+    following, preceding = np.arange(count), np.arange(count)
+    following[start[once[start]]] = end[once[start]]
+    preceding[end[once[end]]] = start[once[end]]
+    places = np.hstack((mesh.vertices, mesh.uvs))
+    for _ in range(_OUTLINE_ROUNDS):
+        places = places / 2 + (places[preceding] + places[following]) / 4
+    return replace(mesh, vertices=places[:, :3], uvs=places[:, 3:])
 
 
 def _mesh_of_blocks(

@@ -68,11 +68,13 @@ def _encode_glb(surface: Surface) -> bytes:
     import trimesh
     from PIL import Image
 
-    from splinecli.surface.mesh import no_triangles
+    from splinecli.surface.mesh import no_triangles, with_smooth_outline
 
     mesh = surface.mesh
     if not len(mesh.triangles):
         raise no_triangles()
+    if mesh.normal_texture is None:  # the outline of a decimated mesh is already smooth
+        mesh = with_smooth_outline(mesh)
 
     def add_rest(buffers: Any, tree: Any) -> None:
         """Add the parts of a glTF file that trimesh cannot write.
