@@ -62,7 +62,7 @@ def test_masks_by_name(folder, name):
     source = open_capture(folder)
     assert check(source) == ["mask_choice"]
     assert str(source.warnings[0]).startswith(
-        f"{Path(name).name} is used as the mask, by its name."
+        f"{Path(name).name} is used as the mask. To use another one, pass"
     )
     balls = find_ball_files(folder)
     assert len(balls.images) == 12 and balls.mask == source.files.mask
@@ -75,7 +75,8 @@ def test_two_masks_are_named_and_none_is_used(folder):
     source = open_capture(folder)
     assert check(source, np.ones_like(DISC)) == ["mask_choice"]
     expected = (
-        "mask_left.png, mask_right.png: none is used as the mask. Choose one with --mask FILE."
+        "No mask is used, because several files may be the mask: mask_left.png, mask_right.png."
+        " Choose one with --mask FILE."
     )
     assert str(source.warnings[0]) == expected
     assert check(open_capture(folder, CaptureOptions(mask=folder / "mask_left.png"))) == [
@@ -208,10 +209,10 @@ REFUSED = {
             "2\na.png 0 0 1\nb.png 0 1 -1",
             "3: found a light below the horizon (z = -1), expected z > 0",
         ),
-        ("2\na.png 0 0 1\nA.PNG 0 1 1", '3: a second light for the image "A.PNG"'),
+        ("2\na.png 0 0 1\nA.PNG 0 1 1", '3: found a second light for the image "A.PNG"'),
         (
             "2\n000.png 0 0 1\nx.png 0 1 1",
-            '3: found 2 lights but 12 images; the image "x.png" is not among them',
+            '3: found 2 lights but 12 images, which do not include "x.png"',
         ),
     ],
     "lights.json": [
@@ -358,7 +359,7 @@ def test_copies_are_one_photograph(folder):
     source = open_capture(folder)
     assert check(source, None) == ["images_left_out"]
     assert str(source.warnings[0]).startswith(
-        "12 files (.jpg) have the names of other images (.png)"
+        "12 files (.jpg) were left out, because images with the same names (.png)"
     )
 
 
@@ -450,7 +451,7 @@ def test_formats_that_need_an_extra_or_are_not_read(folder, monkeypatch):
         prepare_capture(open_capture(folder))
     for path in folder.glob("*.heic"):
         path.rename(path.with_suffix(".jxl"))
-    with pytest.raises(InputError, match=r"no images, but 12 \.jxl files, 1 \.txt file\. PNG,"):
+    with pytest.raises(InputError, match=r"no images, but 12 \.jxl files, 1 \.txt file\. Images"):
         open_capture(folder)
     (folder / "a.pgm").write_bytes(b"P5 40 30 255\n" + bytes(100))
     with pytest.raises(InputError, match="the PGM is truncated"):

@@ -112,7 +112,7 @@ def test_find_captures(tree):
     assert find_captures(tree / "PRPS") == of_prps
     assert find_captures(tree / "PRPS_Diffuse") == of_diffuse
     assert find_captures(tree) == of_prps + of_diffuse
-    assert f"There are captures in {tree}: give that folder." in message(
+    assert f"Pass {tree} instead, which contains captures." in message(
         lambda: find_captures(tree.parent)
     )
     names = [capture_name(folder) for folder in find_captures(tree)]
@@ -132,14 +132,14 @@ def test_missing_files_of_the_object(tmp_path):
     lights = (folder / "light.txt").rename(tmp_path / "l.txt")
     found = message(lambda: open_capture(folder / "images_specular"))
     assert found.startswith(
-        f"{folder}: found no light.txt, expected the light directions of images_specular. Pass --l"
+        f"{folder}: found no light.txt with the light directions of images_specular. Pass --l"
     )
     assert read_capture(folder, lights=lights).n_lights == 5
     lights.rename(folder / "light.txt")
     (folder / "onboundary.png").unlink()
     found = message(lambda: open_capture(folder))
     assert (
-        found.startswith(f"{folder}: found no onboundary.png, expected the masks")
+        found.startswith(f"{folder}: found no onboundary.png, but both masks are needed")
         and "Pass --mask FILE" in found
     )
     mask = tmp_path / "mask.png"

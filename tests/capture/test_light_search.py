@@ -91,7 +91,7 @@ def test_files_that_do_not_fit_or_differ(tmp_path):
     put(folder / "Lights/b.txt", LINES)
     assert check(folder)[1] == ["lights_found"]
     put(folder / "Lights/b.txt", "\n".join(LINES.splitlines()[::-1]))
-    with pytest.raises(InputError, match=r"2 files that may be its lights: a\.txt, b\.txt"):
+    with pytest.raises(InputError, match=r"2 files that fit the images: a\.txt, b\.txt"):
         open_capture(folder)
 
 
@@ -260,7 +260,7 @@ def test_near_ps(tmp_path):
     }
     savemat(folder / "light.mat", lamps)
     savemat(folder / "camera.mat", {"K": matrix})
-    with pytest.raises(InputError, match=r"light\.mat: the scale .* Give --pixel-size: the"):
+    with pytest.raises(InputError, match=r"light\.mat: the scale .* Add --pixel-size: the"):
         open_capture(folder)
     put(folder / "pixel_size.txt", str(width))
     source = open_capture(folder)
@@ -270,7 +270,7 @@ def test_near_ps(tmp_path):
     for name in ("positions", "lobes", "reference_distances", "camera_matrix"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-9)
     (folder / "camera.mat").unlink()
-    with pytest.raises(InputError, match=r"relative to the camera, .* Give --camera-matrix and"):
+    with pytest.raises(InputError, match=r"relative to the camera, .* Add --camera-matrix and"):
         open_capture(folder)
 
 

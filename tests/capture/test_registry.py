@@ -86,12 +86,12 @@ def test_folders_that_are_no_capture(tmp_path):
         (
             "empty",
             Overrides(),
-            r"empty: the folder contains no images, but 1 \.txt file\. PNG, TIFF, JPEG, BMP,",
+            r"empty: the folder contains no images, but 1 \.txt file\. Images can be PNG, TIFF,",
         ),
         (
             "dataset",
             Overrides(),
-            r"no images\. There are captures in .*dataset, such as .*a: give these",
+            r"no images\. Pass one of the captures in .*dataset, such as .*a\.",
         ),
         (
             "dark",
@@ -118,8 +118,8 @@ def test_wrong_filenames_txt(tmp_path):
             r':3: the image "b.png" does not exist\. Correct the name or remove the line\.',
         ),
         ("x" * 300, ':1: the image "x{300}" does not exist'),
-        ("a.png\na.png\n", r':2: the image "a.png" is also on line 1\.'),
-        ("\n\n", r": the list names no images\."),
+        ("a.png\na.png\n", r':2: the image "a.png" is already listed on line 1\.'),
+        ("\n\n", r": the list contains no images\."),
     ):
         (tmp_path / "filenames.txt").write_text(text)
         with pytest.raises(InputError, match=f"filenames.txt{message}"):
@@ -138,7 +138,7 @@ def test_find_captures_finds_none(tmp_path):
     for name, message in (
         (
             ".",
-            r"found no capture, expected folders .*There are captures in .*set: give that folder\.",
+            r"found no capture, expected folders .*Pass .*set instead, which contains captures\.",
         ),
         (
             "empty",

@@ -62,7 +62,10 @@ def folder(tmp_path):
 def test_two_masks_are_named_by_all(folder):
     for name in ("a_mask.pgm", "b.mask.png"):
         write(folder / name, MASK)
-    text = "a_mask.pgm, b.mask.png: none is used as the mask. Choose one with --mask FILE."
+    text = (
+        "No mask is used, because several files may be the mask: a_mask.pgm, b.mask.png. Choose"
+        " one with --mask FILE."
+    )
     source = open_capture(folder)
     assert codes(source) == ["mask_choice"] and str(source.warnings[0]) == text
     assert source.n_lights == 6

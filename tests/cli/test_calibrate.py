@@ -162,7 +162,7 @@ def test_two_masks_of_a_ball_are_named(run):
     write_balls(Path("ball"))
     for name in ("ball.mask.pgm", "old_mask.png"):
         cv2.imwrite(f"ball/{name}", normals()[1].astype(np.uint8) * 255)
-    says = "warning: ball: ball.mask.pgm, old_mask.png: none is used as the mask. Choose one with"
+    says = "several files may be the mask: ball.mask.pgm, old_mask.png. Choose one with"
     run("calibrate ball", says=(says, "from picture"))
 
 

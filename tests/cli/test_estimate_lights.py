@@ -119,7 +119,7 @@ def test_first_light(unlit, run):
     assert angle_between_deg(np.loadtxt("out/ball/light_directions.txt"), LIGHTS).mean() < 15
     np.savetxt(unlit / "light_directions.txt", LIGHTS)
     run(f"infer {unlit} --first-light {side} -o given", code=2, says="Add --lights estimate")
-    words = "the first light comes from 'north'; expected one of right,"
+    words = "found 'north' as the side of the first light, expected one of right,"
     run(f"{crop} --first-light north", code=2, says=words)
 
 
@@ -183,7 +183,7 @@ def test_films_that_cannot_be_used(run):
         (
             3,
             f"{film} --lights estimate",
-            "clip.avi: found 1 of 10 frames that are sharp and differ in their light",
+            "clip.avi: found 1 of 10 frames that are sharp and under different lights",
         ),
         (3, "none.mp4 --lights estimate", "the video does not exist"),
         # a name that would lead out of OUT/frames is none of a film

@@ -140,14 +140,14 @@ def test_a_list_of_images_stays_in_its_folder(capture, make_capture, run):
     (capture / "filenames.txt").write_text("\n".join(names))
     message = (
         "splinecli: sphere/filenames.txt:1: the image"
-        ' "../elsewhere/image1.png" is outside of this folder.'
+        ' "../elsewhere/image1.png" is outside the folder of the list.'
     )
     for command in ("infer --method ls", "info", "evaluate --method ls --n-lights 4"):
-        run(f"{command} {capture}", code=3, says=(message, "set a link to it there"))
+        run(f"{command} {capture}", code=3, says=(message, "link to it from there"))
     (capture / "filenames.txt").write_text(
         "\n".join(str((elsewhere / n).absolute()) for n in names)
     )
-    run(f"info {capture}", code=3, says="is outside of this folder")
+    run(f"info {capture}", code=3, says="is outside the folder of the list")
     # It may name links to images elsewhere.
     for number in range(1, 9):
         (capture / f"photo{number}.png").symlink_to(elsewhere.absolute() / f"image{number}.png")

@@ -94,7 +94,7 @@ REFUSED = """
 --pixel-size 1 --object-width 2 --light-distance 3 | 2 | cannot be used together
 --pixel-size -1 | 2 | --pixel-size is '-1'; expected a number above 0
 --surface --pixel-size 1e9 | 2 | the pixel size is 1e+09 mm, expected
---pixel-size 1 | 2 | --pixel-size concerns near lamps, and bump has no light_positions.txt
+--pixel-size 1 | 2 | --pixel-size needs near lamps, but bump has no light_positions.txt
 --light-positions l.txt --lights l.txt | 2 | cannot be used together
 --light-positions missing.txt | 3 | missing.txt: the file does not exist
 --light-positions l.txt | 3 | the scale of the lamp positions is unknown
@@ -210,7 +210,7 @@ def test_positions_in_another_unit_than_the_pixel_size(run, near, command):
         f"lamp {distances.argmin() + 1} is {distances.min():.3g} from the middle of the object,"
         " which is 64"
     )
-    words = "inside the object. Give all lengths in one unit, such as millimetres"
+    words = "so it would be inside. Use one unit, such as millimetres, for all lengths"
     run(f"{arguments} --strict", code=3, says=(lamp, words))
     for factor, words in (
         (0.3, "A lamp is very near"),

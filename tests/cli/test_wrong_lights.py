@@ -126,7 +126,7 @@ def test_mended_lights(run, medallion):
         run(
             f"info {medallion} --mended-lights mended.{suffix}",
             code=2,
-            says=f"of the type .{suffix} are only read. Write .txt",
+            says=f"of the type .{suffix} can be read but not written. Write .txt",
         )
         assert not Path(f"mended.{suffix}").exists()
 

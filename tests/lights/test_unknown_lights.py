@@ -197,7 +197,7 @@ def test_python():
     for lights_given, options, message in (
         (None, {"pixel_size": 1.0}, "near lamps need positions"),
         (true, {"first_light": "left"}, "first_light is for lights that are found"),
-        (None, {"first_light": "north"}, "first light comes from 'north'"),
+        (None, {"first_light": "north"}, "found 'north' as the side"),
         (None, {"first_light": 400}, "first light comes from '400'"),
     ):
         with pytest.raises(UsageError, match=message):

@@ -1,4 +1,4 @@
-"""Images and lights in memory as a source, for splinecli.estimate_normals."""
+"""Images and lights in memory as a source, for `splinecli.estimate_normals`."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -80,32 +80,32 @@ def open_arrays(
     camera_matrix: ArrayLike | None = None,
     white_level: float | None = None,
 ) -> ArraySource:
-    """Return the source of these images.
+    """Return a source that reads images and lights from memory.
 
     Args:
         images: (F, H, W) gray or (F, H, W, 3) RGB, linear. uint8 and uint16 values are scaled by
             their full range; floating-point values are not scaled.
-        light_directions: (F, 3), towards the lights, of any length; x right, y up, z to the camera.
-            None if they have to be estimated.
-        mask: (H, W), True at the pixels of the object, or numbers above half of their largest one,
-            as in a mask file. None uses all pixels.
-        light_intensities: (F,) or (F, 3) RGB. None means that they are unknown.
-        pixel_size: for near lamps, the width of a pixel on the object; light_directions are then
-            positions in this unit, from the middle of the image on the object's mean plane. None
-            for distant lights.
+        light_directions: (F, 3) vectors towards the lights, of any length; x right, y up, z to the
+            camera. None if they have to be estimated.
+        mask: (H, W), True at the pixels of the object. In a mask of numbers, as in a mask file,
+            these are the values above half of the maximum. None uses all pixels.
+        light_intensities: (F,) or (F, 3) RGB. None if they are unknown.
+        pixel_size: the width of a pixel on the object, for near lamps. In this case,
+            light_directions are positions in the same unit, relative to the centre of the image on
+            the object's mean plane. None for distant lights.
         camera_matrix: (3, 3) in pixels, as in OpenCV. None assumes an orthographic camera.
-        white_level: the value at and above which an observation is saturated, in the unit of the
-            images. None finds it for integer images; floating-point images then have none.
+        white_level: observations at or above this value are saturated, in the unit of the images.
+            None detects it in integer images, and assumes no saturation in floating-point images.
 
     Raises:
         UsageError: a shape or a type is invalid.
-        InputError: a value is not finite or negative, or the mask is empty.
+        InputError: a value is negative or not finite, or the mask is empty.
     """
     stack = _checked_images(images)
     shape, n_lights = stack[0].shape[:2], len(stack)
     if light_directions is None and pixel_size is not None:
         raise UsageError(
-            "light_directions is None, but near lamps need positions", hint="Leave pixel_size out"
+            "near lamps need positions, but light_directions is None", hint="Leave pixel_size out"
         )
     directions = (
         placeholders(n_lights)
@@ -118,7 +118,7 @@ def open_arrays(
         inside = inside > max(inside.max(initial=0) / 2, 0)
     if inside.shape != shape:
         raise UsageError(
-            f"found a mask of shape {inside.shape}, expected (H, W) = {shape} as the images"
+            f"found a mask of shape {inside.shape}, expected (H, W) = {shape}, like the images"
         )
     if not inside.any():
         raise InputError("capture: the mask is empty")
@@ -148,7 +148,7 @@ def _checked_images(images: ArrayLike | Sequence[Array]) -> list[Array]:
         first = stack[0].shape
         if image.shape != first:
             raise UsageError(
-                f"found an image of shape {image.shape} at images[{index}], expected {first} as"
+                f"found an image of shape {image.shape} at images[{index}], expected {first}, like"
                 " images[0]"
             )
         if (
@@ -165,7 +165,7 @@ def _checked_images(images: ArrayLike | Sequence[Array]) -> list[Array]:
                 f"found images of type {image.dtype}, expected uint8, uint16 or floating point"
             )
             raise UsageError(
-                problem, hint="Convert them with images.astype(...), without a change of scale"
+                problem, hint="Convert them with images.astype(...), without changing the scale"
             )
     return stack
 
@@ -182,7 +182,7 @@ def _checked_directions(directions: ArrayLike, n_lights: int) -> Float64Array:
 
 
 def _checked_intensities(intensities: ArrayLike | None, n_lights: int) -> Float64Array:
-    """Return intensities (F, 3); ones if none are given."""
+    """Return intensities (F, 3), all ones by default."""
     if intensities is None:
         return np.ones((n_lights, 3))
     values = np.asarray(intensities, np.float64)

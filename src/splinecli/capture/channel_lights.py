@@ -1,10 +1,10 @@
-"""Colour images under three coloured lamps at once: each channel is an observation under a light of
-its own.
+"""Colour photographs taken under three coloured lamps at once, where each channel is an observation
+under a different light.
 
-A gray matte pixel with the scaled normal b shows I = M s in its channels, where s = (l_R . b, l_G .
-b, l_B . b) and M is the crosstalk matrix: M[c, l] is the response of channel c to lamp l. Reading
-gives s = inverse(M) I. The colour of a surface also changes I, and cannot be separated from its
-shading.
+For a gray matte pixel with the scaled normal b, the three channels are I = M s, where s = (l_R . b,
+l_G . b, l_B . b). M is the crosstalk matrix: M[c, l] is the response of channel c to lamp l. The
+observations are s = inverse(M) I. A coloured surface also changes I, and this cannot be separated
+from its shading.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ from splinecli.maths import Array, Float32Array, Float64Array
 
 CROSSTALK = "crosstalk.txt"
 CHANNELS = 3
-LARGEST_CONDITION = 30.0  # of a crosstalk matrix; noise grows by about so much
+LARGEST_CONDITION = 30.0  # of a crosstalk matrix, which amplifies noise by about this factor
 
 
 @dataclass(frozen=True, eq=False)
 class ChannelLights:
-    """How F / 3 colour images become F observations; image i is channel i % 3 of colour image i //
+    """How F / 3 colour images become F observations. Observation i is channel i % 3 of image i //
     3.
     """
 
     crosstalk: Float64Array  # (1, 3, 3) or (F / 3, 3, 3); see the module
-    measured: bool  # whether a file gives it
+    measured: bool  # whether it was read from a file
 
     def observe(
         self, path: Path, stored: Array, linear: Float32Array, index: int
     ) -> tuple[Array, Float32Array]:
-        """Return one channel (P, 1) of stored pixels, and of linear ones without the light of the
-        other lamps.
+        """Return one channel (P, 1) of the stored pixels and of the linear pixels, without
+        crosstalk.
 
         Raises InputError for a gray image.
         """
         if linear.shape[1] != CHANNELS:
             raise InputError(
-                "the image is gray, but --lights-in-channels reads a light from each of three"
-                " channels",
+                "the image is gray, but --lights-in-channels needs three channels, one for each"
+                " light",
                 path,
                 hint="Leave --lights-in-channels out",
             )
@@ -57,8 +57,9 @@ class ChannelLights:
 
     def in_words(self) -> str:
         text = (
-            "The channels R, G, B of each image are read as photographs under three lamps. This"
-            " is only valid for gray objects; coloured objects get wrong normals."
+            "The red, green and blue channels of each image are treated as photographs under three"
+            " lamps. This is only valid for gray objects: the normals of coloured objects are"
+            " wrong."
         )
         if self.measured:
             return text
@@ -69,7 +70,7 @@ class ChannelLights:
 
 
 def check_crosstalk(matrix: Float64Array, path: Path) -> None:
-    """Raise InputError if the channels (3, 3) do not separate the lamps."""
+    """Raise InputError if the lamps cannot be separated with this matrix (3, 3)."""
     if (matrix < 0).any():
         raise InputError(
             f"found the negative response {matrix.min():g}, expected numbers of at least 0",
@@ -79,7 +80,7 @@ def check_crosstalk(matrix: Float64Array, path: Path) -> None:
     if condition > LARGEST_CONDITION:
         number = f"the condition number {condition:.0f}" if condition < 1e6 else "no inverse"
         raise InputError(
-            f"the channels do not separate the lamps: the crosstalk matrix has {number}",
+            f"the channels do not separate the lamps, because the crosstalk matrix has {number}",
             path,
             hint=f"Expected a condition number of at most {LARGEST_CONDITION:.0f}:"
             " use lamps with more distinct colours",
@@ -87,10 +88,10 @@ def check_crosstalk(matrix: Float64Array, path: Path) -> None:
 
 
 def channel_lights(path: Path | None, n_images: int) -> ChannelLights:
-    """Return the crosstalk of n_images colour images from a file with 3 lines, or 3 for each image;
-    None without a file.
+    """Return the crosstalk of n_images colour images.
 
-    Raises InputError.
+    The file has 3 lines for all images, or 3 lines for each image. Without a file, the channels are
+    assumed to be independent. Raises InputError.
     """
     if path is None:
         return ChannelLights(np.eye(CHANNELS)[None], measured=False)
@@ -103,7 +104,8 @@ def channel_lights(path: Path | None, n_images: int) -> ChannelLights:
             f"found {matrix.shape[0]} x {matrix.shape[1]} numbers, expected 3 x 3, or 3 lines for"
             " each image",
             path,
-            hint="Line c, column l: the response of channel c to lamp l, R G B",
+            hint="Write the response of channel c to lamp l in line c, column l, in the order R G"
+            " B",
         )
     matrices = matrix.reshape(-1, CHANNELS, CHANNELS)
     for each in matrices:
@@ -115,17 +117,17 @@ _REFERENCE = re.compile(
     r"(?<![a-z])(ref|reference|background|bg|empty|blank|flat|baseline|no[_-]?contact|untouched)"
     r"(?![a-z])"
 )
-_FLATTEST = 0.7  # of the gradients of the next flattest picture, at most
+_FLATTEST = 0.7  # largest gradients, relative to the gradients of the next flattest picture
 _UNCHANGED = 0.03  # natural logarithm of the largest ratio between equal pixels
-_LEAST_UNCHANGED = 0.3  # share of the pixels that no other photograph changes
+_LEAST_UNCHANGED = 0.3  # smallest share of pixels that are equal in another photograph
 
 
 def find_reference(images: Sequence[Path]) -> Path | None:
-    """Return the picture of a sensor without contact among photographs with it; None if unclear.
+    """Return the picture of a tactile sensor without contact; None if it is ambiguous.
 
-    It is the only one with such a name, or else a factor of all others: clearly flatter, and equal
-    to each of them in many pixels, those without contact. Raises InputError if an image cannot be
-    read.
+    If exactly one picture has a name such as "background", it is the reference. Otherwise, the
+    reference is clearly flatter than all other pictures, and equal to each of them in the many
+    pixels without contact. Raises InputError if an image cannot be read.
     """
     named = [image for image in images if _REFERENCE.search(image.stem.lower())]
     if named:

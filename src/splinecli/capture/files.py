@@ -1,4 +1,4 @@
-"""The files of a capture: names, which identify their roles, and stamps, which reveal changes."""
+"""The files of a capture. Names identify their roles, and stamps reveal changes."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
 _JPEG = (".jpg", ".jpeg")
 # Treated as images only in a folder without others
 _RARE = (".pgm", ".ppm", ".webp", ".avif", ".heic", ".heif")
-PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG, *_RARE)  # suffixes of pictures, such as masks
-_KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # kinds of files of one photograph, best first
+PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG, *_RARE)  # suffixes of pictures such as masks
+_KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # files of one photograph, the best kind first
 # Suffixes of images of an object
 IMAGE_SUFFIXES = tuple(suffix for suffixes in _KINDS for suffix in suffixes)
 
@@ -51,16 +51,16 @@ GROUND_TRUTH = tuple(
     for stem in ("normal_gt", "normals_gt", "gt_normal", "gt_normals")
 )
 
-# Names of subfolders with the images of a capture, whose other files are in the parent; the first
-# is PSBox's.
+# Names of subfolders for the images of a capture, whose other files are in the parent folder.
+# PSBox uses the first name.
 IMAGE_FOLDERS = ("Objects", "objects", "images", "Images")
 NOT_PHOTOGRAPHS = frozenset(
     Path(name).stem
     for name in (*MASK, *AMBIENT, *GROUND_TRUTH, *own_files(), *FOUND_LIGHTS, *PLOTS)
     if Path(name).suffix in IMAGE_SUFFIXES
 )
-"""Lower-case stems of pictures in a capture's folder that are not images of the object under one
-light. The folder of results may be the same."""
+"""Lower-case stems of pictures that do not show the object under one light. They include results,
+which may be written to the capture's folder."""
 
 
 class NoImagesError(InputError):
@@ -68,13 +68,13 @@ class NoImagesError(InputError):
 
 
 def natural_key(path: Path) -> tuple[list[int | str], str]:
-    """Return a sort key that compares numbers by value: img2 comes before img10."""
+    """Return a sort key that compares numbers by value, so that img2 comes before img10."""
     # split() with a group alternates text and digits, so equal positions have equal types.
     parts = enumerate(re.split(r"([0-9]+)", path.name.casefold()))
     return [int(part) if place % 2 else part for place, part in parts], path.name
 
 
-# words in the names of pictures that are not photographs
+# Words in the names of pictures that are not photographs
 ROLES = {
     "mask": re.compile(r"((?<![a-z])m|(?<=[a-z])M)asks?(?![a-z])"),  # also faceMask
     "ambient": re.compile(r"(?<![a-z])ambient(?![a-z])"),
@@ -82,8 +82,9 @@ ROLES = {
 
 
 def has_role(path: Path, role: str) -> bool:
-    """Return whether a picture's name has the word "mask" or "ambient", as in NAME_mask.png, and is
-    not the usual name of another file.
+    """Return whether a picture's name contains the word "mask" or "ambient", as in NAME_mask.png.
+
+    Names that are reserved for other files are excluded.
     """
     if path.suffix.lower() not in PICTURE_SUFFIXES or path.stem.lower() in NOT_PHOTOGRAPHS:
         return False
@@ -91,10 +92,10 @@ def has_role(path: Path, role: str) -> bool:
 
 
 def list_folder(folder: Path) -> list[Path]:
-    """Return the folder's content in natural order, without hidden files (macOS writes "._"
-    companions of images).
+    """Return the visible content of a folder in natural order.
 
-    Raises InputError if the folder is missing, is a file, or cannot be read.
+    Hidden files are skipped because macOS writes "._" companions of images. Raises InputError if
+    the folder is missing, is a file, or cannot be read.
     """
     mode = find_mode(folder)
     if mode is None:
@@ -103,7 +104,7 @@ def list_folder(folder: Path) -> list[Path]:
         raise InputError(
             "found a file, expected a folder of images",
             folder,
-            hint=f"Give the folder around it, {folder.parent}",
+            hint=f"Pass the folder that contains it, {folder.parent}",
         )
     with reading(folder, "folder"):
         entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
@@ -116,13 +117,13 @@ def list_images(
     leave_out_stems: Collection[str] = NOT_PHOTOGRAPHS,
     leave_out: Collection[Path] = (),
 ) -> tuple[Path, ...]:
-    """Return the images of the folder in natural order, by their suffixes.
+    """Return the images in a folder, identified by their suffixes, in natural order.
 
-    Files of one stem show the same photograph. A PNG or TIFF was developed from a RAW file and
-    replaces it. A JPEG is treated as a copy made by the camera or a viewer, and ignored. Also
-    excluded are files with another role, either by their lower-case stem, such as "mask", or
-    because the user named them, or because their names, but not those of all images, have the word
-    of a role.
+    Files with the same stem are assumed to show the same photograph. A PNG or TIFF file was
+    developed from the RAW file and replaces it. A JPEG file is ignored, because it is usually a
+    copy made by the camera or a viewer. Files with another role are excluded: because of their
+    lower-case stem, such as "mask"; because the user named them; or because their names contain the
+    word of a role, unless the names of all images do.
     """
     others = {resolve(path) for path in leave_out}
     images = [
@@ -150,7 +151,7 @@ def list_images(
 
 
 def check_not_empty(images: Sequence[Path], folder: Path) -> None:
-    """Raise NoImagesError for an empty list of images."""
+    """Raise NoImagesError if there are no images."""
     if not images:
         suffixes = Counter(
             path.suffix.lower() for path in list_folder(folder) if path.suffix and not path.is_dir()
@@ -159,11 +160,11 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
             f"{count} {suffix} file{'s' * (count > 1)}" for suffix, count in suffixes.most_common(3)
         )
         hint = (
-            "PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC and RAW files are read as"
-            " images, and so is one .mat file with a numeric array H x W x F"
+            "Images can be PNG, TIFF, JPEG, BMP, TGA, PGM, PPM, WebP, AVIF, HEIC or RAW files, or"
+            " a single .mat file with a numeric array H x W x F"
         )
         if films := list(filter(is_film, list_folder(folder))):
-            hint = f"A video is given by its own name, as in: splinecli infer {films[0]}"
+            hint = f"Pass the video itself, as in: splinecli infer {films[0]}"
         raise NoImagesError(
             "the folder contains no images" + (f", but {found}" if found else ""),
             folder,
@@ -172,10 +173,10 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
 
 
 def read_image_list(path: Path) -> tuple[Path, ...]:
-    """Return the images that a filenames.txt names, one on each line, relative to its folder.
+    """Return the images listed in a filenames.txt, one on each line, relative to its folder.
 
-    Raises InputError with the line for an image that does not exist or is named twice; also for an
-    empty list.
+    Raises InputError if the list is empty, or with the line if an image is listed twice or does not
+    exist.
     """
     images: dict[Path, int] = {}
     for line, text in enumerate(read_lines(path), start=1):
@@ -187,10 +188,10 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
         image = next(filter(os.path.exists, places), None)
         if Path(name).is_absolute() or ".." in Path(name).parts:
             raise InputError(
-                f'the image "{name}" is outside of this folder',
+                f'the image "{name}" is outside the folder of the list',
                 path,
                 line=line,
-                hint="Copy the image into the folder, or set a link to it there, and name that",
+                hint="Copy the image into the folder or link to it from there, and list that name",
             )
         if image is None:
             raise InputError(
@@ -201,10 +202,12 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
             )
         check_file(image, "an image")
         if image in images:
-            raise InputError(f'the image "{name}" is also on line {images[image]}', path, line=line)
+            raise InputError(
+                f'the image "{name}" is already listed on line {images[image]}', path, line=line
+            )
         images[image] = line
     if not images:
-        raise InputError("the list names no images", path)
+        raise InputError("the list contains no images", path)
     return tuple(images)
 
 
@@ -214,9 +217,9 @@ def find_images(
     leave_out_stems: Collection[str] = NOT_PHOTOGRAPHS,
     leave_out: Collection[Path],
 ) -> tuple[tuple[Path, ...], bool]:
-    """Return the images of a folder, and whether filenames.txt names them; see list_images.
+    """Return the images of a folder, and whether filenames.txt lists them. See list_images.
 
-    Raises NoImagesError for a folder without images, InputError for a wrong filenames.txt.
+    Raises NoImagesError for a folder without images, and InputError for an invalid filenames.txt.
     """
     filenames = find_named(folder, [FILENAMES])
     if filenames is not None:
@@ -230,8 +233,10 @@ def find_images(
 
 
 def list_stack(folder: Path) -> tuple[Path, ...]:
-    """Return the photographs in the only .mat file of a folder with any, such as a.mat[0]; empty
-    for none. Raises InputError for several files.
+    """Return the photographs in the only .mat file of a folder, such as a.mat[0]; empty without
+    one.
+
+    Raises InputError if several files contain photographs.
     """
     found, unread = dict[Path, int](), None
     for path in list_folder(folder):
@@ -246,7 +251,7 @@ def list_stack(folder: Path) -> tuple[Path, ...]:
             f"found {len(found)} .mat files with photographs ({short_list([*found])}), expected"
             " one",
             folder,
-            hint="Give each capture a folder of its own",
+            hint="Put each capture into its own folder",
         )
     if unread is not None and not found:
         raise unread
@@ -256,7 +261,7 @@ def list_stack(folder: Path) -> tuple[Path, ...]:
 
 
 def short_list(paths: Sequence[Path], most: int = 3) -> str:
-    """Return the names of the first files for a message."""
+    """Return the names of the first files, for a message."""
     return ", ".join(path.name for path in paths[:most]) + (", ..." if len(paths) > most else "")
 
 
@@ -264,31 +269,32 @@ def short_list(paths: Sequence[Path], most: int = 3) -> str:
 class CaptureFiles:
     """The files of one capture, with the images in the order of the lights."""
 
-    layout: str  # readable name of the arrangement of files
-    name: str  # name of the capture, in most layouts the folder's name
-    folder: Path  # the folder with the files beside the images
+    layout: str  # readable name of the layout
+    name: str  # name of the capture, usually the folder's name
+    folder: Path  # the folder that contains the other files
     images: tuple[Path, ...]
-    # F x 3 text, or a file that names images, which sets the order of the images; None if no lights
-    # are needed
+    # F x 3 text, or a file that names the images and so defines their order. None if no lights are
+    # needed
     light_directions: Path | None
-    light_intensities: Path | None = None  # F x 3 text, or None if no file gives them
+    light_intensities: Path | None = None  # F x 3 text, or None without such a file
     mask: Path | None = None  # an image, or None to use every pixel
     ground_truth: Path | None = None  # a normal map, or None
-    # used instead of a mask: images whose pixels above zero together are the object
+    # used instead of a mask: the object is the union of the non-zero pixels of these images
     boundaries: tuple[Path, ...] = ()
     ambient: Path | None = None  # an image under none of the lights, or None
-    # pictures beside the images that are not photographs, judging by their names
+    # pictures next to the images that are not photographs according to their names
     others: tuple[Path, ...] = ()
-    # zero-based places in the light file of the images; None for all
+    # zero-based positions of the images in the light file; None for all
     kept: tuple[int, ...] | None = None
-    warnings: tuple[CaptureWarning, ...] = ()  # choices made among files with unusual names
+    warnings: tuple[CaptureWarning, ...] = ()  # report choices among files with unusual names
 
 
 @dataclass(frozen=True)
 class Overrides:
-    """Files named by the user, which replace those in the folder.
+    """Files named by the user, which take precedence over the files in the folder.
 
-    Without needs_lights, light files in the folder are ignored, and a missing one is not an error.
+    If needs_lights is false, light files in the folder are ignored, and a missing one is not an
+    error.
     """
 
     lights: Path | None = None
@@ -298,7 +304,7 @@ class Overrides:
     needs_lights: bool = field(default=True, kw_only=True)
 
     def named(self) -> tuple[Path, ...]:
-        """Return the files that are given. Raises InputError for a path that is not a file."""
+        """Return the files named by the user. Raises InputError for a path that is not a file."""
         given = self.lights, self.intensities, self.mask, self.ground_truth
         files = tuple(file for file in given if file is not None)
         for file in files:
@@ -307,8 +313,8 @@ class Overrides:
 
 
 def find_named(folder: Path, names: Sequence[str]) -> Path | None:
-    """Return the file with the first of these names in the folder, ignoring case; None if there is
-    none.
+    """Return the file in the folder that has the first of these names, ignoring case; None if none
+    exists.
     """
     entries = {entry.name.lower(): entry for entry in list_folder(folder)}
     files = (entries[name] for name in names if name in entries)
@@ -316,8 +322,9 @@ def find_named(folder: Path, names: Sequence[str]) -> Path | None:
 
 
 def folder_name(folder: Path) -> str:
-    """Return the folder's own name, including for ".", ".." and a trailing slash; a link's own
-    name. Raises InputError.
+    """Return the name of a folder, even if it is given as ".", ".." or with a trailing slash.
+
+    A link keeps its own name. Raises InputError.
     """
     path = folder.absolute()
     return (resolve(path) if ".." in path.parts else path).name or "capture"
@@ -326,16 +333,16 @@ def folder_name(folder: Path) -> str:
 def stamp_files(
     files: CaptureFiles, flat_field: Sequence[Path], lamps: Sequence[Any]
 ) -> tuple[Any, ...]:
-    """Return JSON values that change when a file of the capture does. Compute them before reading
-    the files.
+    """Return JSON values that change whenever a file of the capture changes.
 
-    Images and flat fields are stamped by path, size and modification time, because reading them is
-    slow. All other files (lights, intensities, mask, ground truth, ambient image) are stamped by
-    their content. Raises InputError if a file cannot be read.
+    Compute them before reading the files. Images and flat fields are stamped by path, size and
+    modification time, because reading them is slow. All other files (lights, intensities, mask,
+    ground truth, ambient image) are stamped by their content. Raises InputError if a file cannot be
+    read.
     """
     lights = files.light_directions, files.light_intensities
     small = *files.boundaries, *lights, files.mask, files.ground_truth, files.ambient
-    # a folder of lights stands for the names of its images, which are stamped
+    # If the lights are in the names of the images, light_directions is a folder.
     paths = [path for path in small if path is not None and not is_folder(path)]
     contents = [stamp_content(page_of(path)[0]) for path in paths]
     return (
@@ -346,7 +353,8 @@ def stamp_files(
 
 
 def stamp_content(path: Path) -> Any:
-    """Return the SHA-256 of a file, or the path, size and modification time of one over 64 MiB.
+    """Return the SHA-256 of a file, or for more than 64 MiB its path, size and modification time.
+
     Raises InputError.
     """
     check_file(path, "a file", pipe=True)
@@ -357,7 +365,7 @@ def stamp_content(path: Path) -> Any:
 
 
 def digest(stamp: Sequence[Any]) -> str:
-    """Return the SHA-256 of a stamp, or of any JSON values, in hexadecimal digits."""
+    """Return the SHA-256 of a stamp, or of any JSON values, as hexadecimal digits."""
     return hashlib.sha256(json.dumps(stamp).encode()).hexdigest()
 
 

@@ -1,10 +1,10 @@
-"""Find the files of a capture in a folder, and the captures of a dataset: the layouts are tried in
-turn.
+"""Find the files of a capture in a folder, and the captures of a dataset, by trying one layout
+after another.
 
-The layout of CyclesPS (Ikehata, ECCV 2018): folders images_<kind>/ beside the files that all kinds
-share. As published, PRPS/<object> contains images_specular and images_metallic,
-PRPS_Diffuse/<object> images_diffuse, each with one image for each line of the object's light.txt:
-00000.tif and so on. A capture is one such folder.
+In the layout of CyclesPS (Ikehata, ECCV 2018), an object has folders images_<kind>/ and files that
+all kinds share. In the published tree, PRPS/<object> contains images_specular and images_metallic,
+and PRPS_Diffuse/<object> contains images_diffuse. Each of these folders is a capture with one
+image, 00000.tif and so on, for each line of the object's light.txt.
 """
 
 import re
@@ -36,11 +36,10 @@ _BOUNDARIES = ("inboundary.png", "onboundary.png")
 
 
 def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFiles | None:
-    """Return the files of images_<kind> in an object's folder, or of an object's only one; None for
-    another layout.
+    """Return the files of a folder images_<kind>, or of an object with only one such folder.
 
-    Raises InputError if a file is missing, there are several such folders, or the images do not
-    match the lights.
+    None for another layout. Raises InputError if a file is missing, there are several such folders,
+    or the images do not match the lights.
     """
     captures = list_cyclesps(folder)
     if captures is None:
@@ -54,13 +53,13 @@ def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFile
         raise InputError(
             f"found {len(captures)} folders of images ({names}), expected one",
             folder,
-            hint=f"Give one of them, such as {images_folder}",
+            hint=f"Pass one of them, such as {images_folder}",
         )
     holder = _parent(images_folder)
     lights = overrides.lights or files.find_named(holder, ["light.txt"])
     if lights is None:
         raise InputError(
-            f"found no light.txt, expected the light directions of {images_folder.name}",
+            f"found no light.txt with the light directions of {images_folder.name}",
             holder,
             hint="Pass --lights FILE, with one line x y z for each image",
         )
@@ -71,7 +70,8 @@ def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFile
     )
     if missing := [name for name, path in masks.items() if path is None]:
         raise InputError(
-            f"found no {' and no '.join(missing)}, expected the masks whose union is the object",
+            f"found no {' and no '.join(missing)}, but both masks are needed: their union is the"
+            " object",
             holder,
             hint="Pass --mask FILE",
         )
@@ -89,8 +89,9 @@ def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFile
 
 
 def list_cyclesps(folder: Path) -> list[Path] | None:
-    """Return the folder if it is a folder of images, or the folders of images of an object; None
-    for another layout.
+    """Return the folders of images of a CyclesPS object, or the folder itself if it is one of them.
+
+    None for another layout.
     """
     is_images_folder = files.folder_name(folder).startswith(_PREFIX) and _has_marks(_parent(folder))
     usual_lights = [name for each in FORMATS if not each.rank for name in each.found]
@@ -98,7 +99,7 @@ def list_cyclesps(folder: Path) -> list[Path] | None:
         not (is_images_folder or _has_marks(folder))
         or files.find_named(folder, usual_lights) is not None
     ):
-        return None  # a light file of its own makes it a plain folder
+        return None  # a folder with its own light file is a plain folder
     if is_images_folder:
         return [folder]
     captures = [path for path in _subfolders(folder) if path.name.startswith(_PREFIX)]
@@ -114,8 +115,9 @@ def _name(images_folder: Path) -> str:
 
 
 def _has_marks(folder: Path) -> bool:
-    """Return whether there are two of four files: some may be missing, and no other folder is
-    mistaken for one.
+    """Return whether the folder contains at least two of the four files that identify CyclesPS.
+
+    Some may be missing, but no other dataset has two of them.
     """
     marks = {"light.txt", "gt_normal.tif", *_BOUNDARIES}
     names = {entry.name.lower() for entry in files.list_folder(folder) if not is_folder(entry)}
@@ -143,7 +145,7 @@ def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...
 
 # The light file of PSBox (Y. Xiong), whose images are in the folder Objects
 _PSBOX_LIGHTS = ("light_directions.txt",)
-# Words in the names of pictures that other programs leave beside the photographs.
+# Words in the names of pictures that other programs write next to the photographs.
 _IMAGE_FOLDERS = ("images", "image", "imgs", "img", "photos", "photographs", "pictures", "objects")
 _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all", "depth"})
 
@@ -155,11 +157,11 @@ def _is_other(image: Path, words: frozenset[str] = _OTHER_WORDS) -> bool:
 def find_capture_files(
     folder: StrPath, overrides: files.Overrides | None = None
 ) -> files.CaptureFiles:
-    """Return the files of the capture in the folder. The overrides replace those in the folder.
+    """Return the files of the capture in a folder. Overrides take precedence over its own files.
 
-    Raises InputError if the folder is missing, is a file or contains no images; filenames.txt names
-    an image that does not exist; the light file is missing; or a file of the overrides does not
-    exist.
+    Raises InputError if the folder is missing, is a file or contains no images; if filenames.txt
+    lists an image that does not exist; if the light file is missing; or if a file of the overrides
+    does not exist.
     """
     folder, overrides = Path(folder), overrides or files.Overrides()
     files.list_folder(folder)  # raises if it is not a folder
@@ -178,25 +180,26 @@ def find_capture_files(
         raise InputError(
             error.problem,
             folder,
-            hint=f"There are captures in {folder}, such as {captures[0]}: give these",
+            hint=f"Pass one of the captures in {folder}, such as {captures[0]}",
         ) from None
 
 
 def capture_name(folder: StrPath) -> str:
-    """Return the capture's name, from its folder or video; in CyclesPS <object>_<kind>. Raises
-    InputError.
+    """Return the capture's name: its folder or video, or for CyclesPS <object>_<kind>.
+
+    Raises InputError.
     """
     folder = Path(folder)
     if is_film(folder):
         return folder.stem
     captures = None
-    with suppress(InputError):  # reading the capture will raise it again
+    with suppress(InputError):  # reading the capture raises it again
         captures = list_cyclesps(folder) if is_folder(folder) else None
     return _name(captures[0]) if captures and len(captures) == 1 else _own_name(folder)
 
 
 def _own_name(folder: Path) -> str:
-    """Return the name of a folder, or its parent's name if the folder is called `images`. Raises
+    """Return a folder's name, or its parent's name for a folder such as `images`. Raises
     InputError.
     """
     name, parent = files.folder_name(folder), _parent(folder)
@@ -205,7 +208,9 @@ def _own_name(folder: Path) -> str:
 
 
 def _images_folder(folder: Path) -> Path | None:
-    """Return the folder of images of a capture without images of its own; None if there is none."""
+    """Return the subfolder with the images of a capture; None if the images are not in a
+    subfolder.
+    """
     inside = next((path for name in files.IMAGE_FOLDERS if is_folder(path := folder / name)), None)
     if inside is None and not files.list_images(folder) and has_lights(folder):
         others = [
@@ -218,13 +223,15 @@ def _images_folder(folder: Path) -> Path | None:
 
 
 def _holder(folder: Path) -> Path:
-    """Return the folder around a folder called `images` or similarly that has no light file of its
-    own.
+    """Return the parent of a folder named `images` or similarly, unless the folder has its own
+    lights.
+
+    Other folders are returned as they are.
     """
     around, name = _parent(folder), files.folder_name(folder)
     if name.lower() not in _IMAGE_FOLDERS or has_lights(folder):
         return folder
-    with suppress(InputError):  # we may lack permission to read the one around
+    with suppress(InputError):  # the parent may be unreadable
         inside = _images_folder(around)
         if inside is not None and inside.name == name:
             return around
@@ -232,15 +239,14 @@ def _holder(folder: Path) -> Path:
 
 
 def find_captures(folder: StrPath) -> list[Path]:
-    """Return the captures of a dataset's folder in natural order; only the folder itself if it is a
-    capture.
+    """Return the captures of a dataset in natural order; only the folder itself if it is a capture.
 
-    A capture is a folder with a light file beside its images, or beside the folder Objects that
-    contains them (PSBox), or a folder of images of a CyclesPS object. An object of CyclesPS and its
-    published tree are datasets, too. The captures are found by names of files; reading one may
-    still fail. A subfolder that cannot be listed is treated as a capture, so that the caller
-    reports the error on reading it. Raises InputError if the folder is missing, is a file, or
-    contains no capture.
+    A capture is a folder of images with a light file, a folder with a light file and a subfolder
+    Objects of images (PSBox), or a folder of images of a CyclesPS object. A CyclesPS object and the
+    published tree are datasets, too. Captures are identified by the names of their files, so
+    reading one may still fail. A subfolder that cannot be listed is treated as a capture, so that
+    the caller reports the error when reading it. Raises InputError if the folder is missing, is a
+    file, or contains no capture.
     """
     folder = Path(folder)
     inside = _subfolders(folder)
@@ -253,7 +259,7 @@ def find_captures(folder: StrPath) -> list[Path]:
     raise InputError(
         f"found no capture, expected folders of images with a light file ({light_names()})",
         folder,
-        hint=f"There are captures in {deeper[0]}: give that folder" if deeper else None,
+        hint=f"Pass {deeper[0]} instead, which contains captures" if deeper else None,
     )
 
 
@@ -283,7 +289,7 @@ def _captures_in(folder: Path) -> list[Path]:
 
 
 def _captures_below(folder: Path) -> list[Path]:
-    """Return the captures in the folder, and in its subfolders if it is a part of CyclesPS's
+    """Return the captures in a folder, and in its subfolders for the first level of CyclesPS's
     tree.
     """
     try:
@@ -295,10 +301,10 @@ def _captures_below(folder: Path) -> list[Path]:
 
 
 def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
-    """Return the capture's files. Raises InputError if images or lights are missing, or
-    filenames.txt is wrong.
+    """Return the files of a plain folder, or of DiLiGenT's layout.
 
-    A folder with filenames.txt and light_directions.txt has the layout of DiLiGenT (Shi et al.).
+    DiLiGenT (Shi et al.) has filenames.txt and light_directions.txt. Raises InputError if images or
+    lights are missing, or if filenames.txt is invalid.
     """
     name = _own_name(folder)
     if overrides.needs_lights and overrides.lights is None:
@@ -306,10 +312,10 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
     listed = files.find_named(folder, [files.FILENAMES]) is not None
     of_images = folder if listed else _images_folder(folder) or folder
     images, _ = files.find_images(of_images, leave_out=overrides.named())
-    # Without a light file, nothing gives the number of photographs.
+    # Without a light file, the number of photographs is unknown.
     words = _OTHER_WORDS if overrides.needs_lights else _OTHER_WORDS | {"demo", "result", "results"}
     others = tuple(image for image in images if _is_other(image, words))
-    if listed or len(others) > 0.25 * len(images):  # so many are photographs
+    if listed or len(others) > 0.25 * len(images):  # too many: they are photographs
         others = ()
     images = tuple(image for image in images if image not in others)
     lights = overrides.lights or (find_light_file(folder) if overrides.needs_lights else None)
@@ -320,7 +326,7 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
         raise _no_lights(folder, images)
     layout, ground_truth = "plain folder", files.GROUND_TRUTH
     if listed and files.find_named(folder, ["light_directions.txt"]) is not None:
-        # normal.txt comes last: the one of harvestPNG is upside down, and its .mat is right.
+        # normal.txt comes last, because harvestPNG's is upside down, while its .mat is correct.
         layout, ground_truth = "DiLiGenT", (*files.GROUND_TRUTH, "normal.txt")
     found = _gather(layout, folder, images, lights, overrides, ground_truth, others)
     of_copies = () if listed else copies(images)
@@ -328,23 +334,25 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
 
 
 def _no_lights(folder: Path, images: Sequence[Path]) -> InputError:
-    """Return the error that names the options with which a capture without a light file is read: a
-    NoLightsError if the images may do without.
+    """Return the error for a capture without a light file, with a hint about the options for
+    reading it.
+
+    If the lights can be estimated from the images, the error is a NoLightsError.
     """
     option = light_option([folder, images[0].parent, _parent(folder)], images)
     count = "1 image" if len(images) == 1 else f"{len(images)} images"
     problem = f"found {count} ({files.short_list(images)}) but no light file"
     if len(images) < MIN_LIGHTS:
         hint = (
-            "A normal needs at least three photographs under different lights; a colour photograph"
-            f" under three coloured lamps is read with --lights-in-channels {option or ''}"
+            "A normal needs at least three photographs under different lights; for a colour"
+            f" photograph under three coloured lamps, add --lights-in-channels {option or ''}"
         )
         return InputError(problem, folder, hint=hint.rstrip())
     if option:
         return InputError(problem, folder, hint=f"Add {option}")
     hint = (
-        "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' makes"
-        " the file from images of a mirror ball. Without one, --lights estimate finds them"
+        "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' creates"
+        " this file from images of a mirror ball. Without one, --lights estimate finds the lights"
         " from the images, with lower accuracy. These light files are found by name:"
         f" {light_names()}"
     )
@@ -352,8 +360,8 @@ def _no_lights(folder: Path, images: Sequence[Path]) -> InputError:
 
 
 def _find_psbox(folder: Path, overrides: files.Overrides) -> files.CaptureFiles | None:
-    """Return the files of a capture of PSBox, whose images are in a folder of their own; None for
-    another layout.
+    """Return the files of a PSBox capture, whose images are in a subfolder; None for another
+    layout.
     """
     lights = overrides.lights or files.find_named(folder, _PSBOX_LIGHTS)
     objects = folder / files.IMAGE_FOLDERS[0]
@@ -373,7 +381,7 @@ def _gather(
     ground_truth: Sequence[str] = files.GROUND_TRUTH,
     others: tuple[Path, ...] = (),
 ) -> files.CaptureFiles:
-    """Return the capture's files: the images, the lights, and any optional files in the folder.
+    """Return the capture's images and lights with the optional files in the folder.
 
     Files named by the user take precedence over files in the folder.
     """

@@ -3,9 +3,9 @@ their images.
 
 Frame: x right, y up, z to the camera; a direction points from the object to the light.
 
-The names in a file often come from another machine, with folders that do not exist here, or are
-only numbers. So the images of the folder are matched to them by base name, then by name without
-suffix, then by order.
+Image names in a light file often come from another machine, where the folders differ, or are only
+numbers. Therefore, the images in the folder are matched by base name, then by name without suffix,
+then by order.
 """
 
 import io
@@ -30,7 +30,7 @@ _FILE = "a text file with a line {} for each image"
 
 
 class WrongCountError(InputError):
-    """A light file is for a different number of images: n_found."""
+    """A light file has n_found lights, which is not the number of images."""
 
     n_found = 0
 
@@ -64,15 +64,15 @@ class LightFormat:
     """A format of light files. To add one, write its reader and a row of FORMATS."""
 
     name: str  # for messages
-    # in lower case; none for the format of all files with a suffix that no other row has
+    # in lower case; empty for the format of all other suffixes
     suffixes: tuple[str, ...]
     read: Callable[[Path, int | None, RowForm], NumberRows]  # see light_formats
-    # names of the light file of a folder, in any case; "*" stands for any text
+    # names under which a light file is found in a folder, in any case; "*" stands for any text
     found: tuple[str, ...]
-    # files of a lower rank are found first. In rank 0, the first name wins; in others, two are an
-    # error
+    # A lower rank takes precedence. Within rank 0, the first name wins; within another rank, two
+    # files are an error
     rank: int = 0
-    # from directions (F, 3); None if only read
+    # from directions (F, 3); None for a format that is only read
     encode: Callable[[Float64Array, Sequence[Path]], bytes] | None = None
 
 
@@ -118,12 +118,12 @@ FORMATS = (
 
 
 def format_of(path: Path) -> LightFormat:
-    """Return the format of a light file; that of text for an unknown suffix."""
+    """Return the format of a light file, which is text for an unknown suffix."""
     return next((each for each in FORMATS if path.suffix.lower() in each.suffixes), FORMATS[0])
 
 
 def light_suffixes() -> str:
-    """Return the suffixes of light files, for help."""
+    """Return the suffixes of light files, for help texts."""
     suffixes = (suffix for each in FORMATS for suffix in each.suffixes)
     return ", ".join(dict.fromkeys(("text", *suffixes)))
 
@@ -136,11 +136,11 @@ def read_light_directions(
 ) -> Float64Array:
     """Return unit light directions (F, 3) float64 from a light file, in the order of the file.
 
-    A row is x y z, separated by spaces, tabs, commas or semicolons. A header, which may name the
-    columns in another order, and a first line with only the number of lights, are accepted (the
-    University of Washington's lights.txt). If N x 3 does not fit, 3 x N is read (PSBox); 3 x 3 is
-    read as rows. A first column that counts the rows, from 0 or 1, gives their order. Vectors may
-    have any length above zero.
+    Each row contains x y z, separated by spaces, tabs, commas or semicolons. Both a header, which
+    may name the columns in another order, and a first line with only the number of lights are
+    accepted (as in the University of Washington's lights.txt). If N x 3 does not fit, the file is
+    read as 3 x N (PSBox); 3 x 3 is read as rows. If the first column numbers the rows from 0 or 1,
+    it determines their order. Vectors may have any length above zero.
 
     Args:
         n_images: the expected number of lights, if it is known.
@@ -158,11 +158,10 @@ def read_light_directions(
 def read_light_positions(
     path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME
 ) -> Float64Array:
-    """Return the positions of lamps (F, 3) float64 from a file, which has the form of light
-    directions.
+    """Return the positions of lamps (F, 3) float64 from a file in a format for light directions.
 
-    Raises InputError as read_light_directions, which checks the same numbers as directions from the
-    origin; also for rows that name their images.
+    Raises InputError as read_light_directions does for directions from the origin, and for rows
+    that name their images.
     """
     path = Path(path)
     table = format_of(path).read(path, n_images, "positions")
@@ -185,8 +184,9 @@ def lights_of(
     *,
     leave_bad: bool = False,
 ) -> tuple[Float64Array, Float64Array]:
-    """Return vectors (F, 3) of any length in the usual frame, and the same at unit length; see
-    unit_directions.
+    """Return vectors (F, 3) of any length in the usual frame, and the same vectors at unit length.
+
+    See unit_directions for the errors.
     """
     if table.are_vectors:
         form = "positions" if form == "positions" else "xyz"
@@ -196,8 +196,8 @@ def lights_of(
         )
         if form == "xyz":
             light_rows.refuse_angles(table)
-    what = {"xyz": "light directions", "positions": "lamp positions"}.get(form, "lights")
-    vectors, transposed = _one_light_a_row(table, light_rows.COLUMNS[form], what, n_images)
+    meaning = {"xyz": "light directions", "positions": "lamp positions"}.get(form, "lights")
+    vectors, transposed = _one_light_a_row(table, light_rows.COLUMNS[form], meaning, n_images)
     if form in ("azel", "slant-tilt"):
         light_rows.check_angles(table, form)
         vectors = light_rows.directions_from_angles(vectors, form)
@@ -214,12 +214,12 @@ def lights_of(
     )
 
 
-_ENOUGH_ABOVE = 6  # lights above the image plane, from which others are left out
-_LOWEST_Z = 1e-6  # of a light above the plane: rounded angles of 90 degrees have less
+_ENOUGH_ABOVE = 6  # with as many lights above the image plane, lights below it are ignored
+_LOWEST_Z = 1e-6  # for a light above the plane; less if 90 degrees were rounded
 
 
 def above_plane(directions: Float64Array) -> Bools:
-    """Return which of the unit directions (F, 3) are above the image plane."""
+    """Return a boolean array (F,), true for unit directions (F, 3) above the image plane."""
     return np.asarray(directions[:, 2] > _LOWEST_Z)
 
 
@@ -232,20 +232,18 @@ def unit_directions(
     lamps: bool = False,
     leave_bad: bool = False,
 ) -> Float64Array:
-    """Return vectors (F, 3) at unit length.
+    """Return vectors (F, 3) of any length, scaled to unit length.
 
-    Raises InputError for a zero vector, or a light that is not above the horizon.
+    Raises InputError for a zero vector and for a light that is not above the horizon.
 
     Args:
-        vectors: of any length.
-        places: words for the place of each vector on its line.
+        places: a description of each vector's place on its line.
         lamps: whether the vectors are positions of lamps, for messages.
-        leave_bad: return lights that are zero or not above the horizon as they are, for the caller
-            to drop, if enough others are left.
+        leave_bad: whether to return zero vectors and lights below the horizon as they are, for the
+            caller to drop, if enough other lights remain.
     """
     largest = np.abs(vectors).max(axis=1, keepdims=True)
-    # First divide by the largest component, because squares of very large or small ones exceed
-    # float64's range.
+    # Dividing by the largest component first keeps all squares within float64's range.
     scaled = np.divide(vectors, largest, out=np.zeros_like(vectors), where=largest > 0)
     directions = unit(scaled)
     if leave_bad and np.count_nonzero(above_plane(directions)) >= _ENOUGH_ABOVE:
@@ -260,12 +258,12 @@ def unit_directions(
                 hint="Write x y z towards the light, or remove the line and its image",
             )
         if z <= 0:
-            what = "lamp behind the object" if lamps else "light below the horizon"
+            found = "lamp behind the object" if lamps else "light below the horizon"
             hint = "z points to the camera; the file may be in another frame"
             if (directions[:, 2] < 0).all():
                 hint = "z points away from the camera in this file: add --light-frame z-away"
             raise InputError(
-                f"found a {what}{place} (z = {vector[2]:g}), expected z > 0",
+                f"found a {found}{place} (z = {vector[2]:g}), expected z > 0",
                 path,
                 line=line,
                 hint=hint,
@@ -276,8 +274,8 @@ def unit_directions(
 def read_light_intensities(path: StrPath, n_images: int) -> Float64Array:
     """Return light intensities (F, 3) float64 in RGB order from a text file, N x 3 or 3 x N.
 
-    A single number for each light is used for all three channels. Raises InputError as
-    read_light_directions; also with the line for an unusable intensity.
+    A single number for each light applies to all three channels. Raises InputError as
+    read_light_directions does, and with the line for an unusable intensity.
     """
     table = _drop_count_line(
         numbers.read_number_rows(Path(path), expected=_FILE.format("r g b")), n_images
@@ -297,7 +295,7 @@ def read_light_intensities(path: StrPath, n_images: int) -> Float64Array:
 
 
 def _sort_by_count(table: NumberRows, n_columns: int, n_images: int | None) -> NumberRows:
-    """Return the table in the order of a first column that counts the lights, and without that
+    """Return the table sorted by a first column that numbers the lights, and without this
     column.
     """
     rows = table.rows
@@ -310,7 +308,7 @@ def _sort_by_count(table: NumberRows, n_columns: int, n_images: int | None) -> N
 
 
 def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
-    """Return the table without a first line that only counts the lights."""
+    """Return the table without a first line that contains only the number of lights."""
     first, *following = table.rows
     if len(first.numbers) != 1 or not following:
         return table
@@ -329,17 +327,16 @@ def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
         f"the count line states {count:.0f}, but {len(following)} rows follow",
         table.path,
         line=first.line,
-        hint="Correct the count or leave it out",
+        hint="Correct the count or remove the line",
     )
 
 
 def _one_light_a_row(
-    table: NumberRows, names: dict[int, str], what: str, n_images: int | None
+    table: NumberRows, names: dict[int, str], meaning: str, n_images: int | None
 ) -> tuple[Float64Array, bool]:
-    """Return the numbers with one light in each row, and whether the file has one light in each
-    column.
+    """Return the numbers with one light in each row, and whether they had to be transposed.
 
-    `names` has the possible counts of numbers for a light, each with its meaning.
+    `names` contains the possible number of values for a light, each with its meaning.
     """
     values = table.as_array()
     n_columns = values.shape[1]
@@ -347,7 +344,7 @@ def _one_light_a_row(
         (lights, lights is not values) for lights in (values, values.T) if lights.shape[1] in names
     ]
     if not readings:
-        expected = " or ".join(f"{count} ({meaning})" for count, meaning in names.items())
+        expected = " or ".join(f"{count} ({name})" for count, name in names.items())
         text = table.rows[0].text
         decimal_commas = n_columns > 3 and (
             numbers.has_decimal_commas(text) or (n_columns == 6 and text.count(",") >= 3)
@@ -362,10 +359,10 @@ def _one_light_a_row(
         if n_images is None or len(lights) == n_images:
             return lights, transposed
     count = len(readings[0][0])
-    if count == 1 and what in ("light directions", "lights"):
-        what = what[:-1]
-    problem = f"found {count} {what}, expected {n_images}, one for each image"
-    hint = "The file needs one line for each image, in the order of the images"
+    if count == 1 and not meaning.endswith("ies"):
+        meaning = meaning[:-1]
+    problem = f"found {count} {meaning}, expected {n_images}, one for each image"
+    hint = "Write one line for each image, in the order of the images"
     error = WrongCountError(problem, table.path, hint=hint)
     error.n_found = count
     raise error
@@ -377,17 +374,19 @@ def rows_text(values: Float64Array) -> str:
 
 
 def match_images(table: NumberRows, images: Sequence[Path]) -> tuple[tuple[Path, ...], str]:
-    """Return the image that each row names, and how it was matched: "name", "name without suffix"
-    or "order".
+    """Return the image for each row, and how they were matched: "name", "name without suffix" or
+    "order".
 
-    Images that no row names are left out, unless they are matched by order. Raises InputError if
-    two rows have the same name, or neither the names nor the number of images fit.
+    Images without a row are left out, unless they are matched by order. Raises InputError if two
+    rows have the same name, or if neither the names nor the number of images match.
     """
     names = table.names or ()
     seen = set()
     for name, row in zip(names, table.rows, strict=True):
         if name.casefold() in seen:
-            raise InputError(f'a second light for the image "{name}"', table.path, line=row.line)
+            raise InputError(
+                f'found a second light for the image "{name}"', table.path, line=row.line
+            )
         seen.add(name.casefold())
     for how, part in (("name", "name"), ("name without suffix", "stem")):
         by_key = {getattr(image, part).casefold(): image for image in reversed(images)}
@@ -398,24 +397,24 @@ def match_images(table: NumberRows, images: Sequence[Path]) -> tuple[tuple[Path,
         return tuple(images), "order"
     present = {image.name.casefold() for image in images}
     missing = next((i for i, name in enumerate(names) if name.casefold() not in present), 0)
-    problem = f"found {len(names)} lights but {len(images)} images; the image"
     raise InputError(
-        f'{problem} "{names[missing]}" is not among them',
+        f"found {len(names)} lights but {len(images)} images, which do not include"
+        f' "{names[missing]}"',
         table.path,
         line=table.rows[missing].line,
-        hint="Correct the names in the file, or give as many images as lights, in the same order",
+        hint="Correct the names in the file, or use as many images as lights, in the same order",
     )
 
 
 def read_lights(
     path: Path, n_images: int, frame: LightFrame = USUAL_FRAME, form: RowForm = "xyz"
 ) -> tuple[NumberRows, Float64Array]:
-    """Return the rows of any light file, which may name their images (see match_images), and their
-    directions (F, 3). Of a folder of images, the lights in their names are read.
+    """Return the rows of any light file, which may name their images, and their directions (F, 3).
 
-    The frame of a file of AliceVision is relative to its own, which has y down and z away. Raises
-    InputError; see read_light_directions. Lights that are not above the horizon are left as they
-    are if enough others are.
+    For a folder of images, the lights are read from the image names. The frame of an AliceVision
+    file is relative to its own, which has y down and z away. Lights below the horizon are returned
+    unchanged if enough other lights remain. Raises InputError; see read_light_directions and
+    match_images.
     """
     read = read_names if is_folder(path) else format_of(path).read
     table = read(path, n_images, form)
@@ -424,22 +423,22 @@ def read_lights(
 
 
 def light_encoder(path: Path) -> Callable[[Float64Array, Sequence[Path]], bytes]:
-    """Return the encoder of the format that a file's suffix names. Raises UsageError if it can only
-    be read.
+    """Return the encoder for the format of a file's suffix. Raises UsageError if it can only be
+    read.
     """
     encode = format_of(path).encode
     if encode is None:
         suffixes = (each.suffixes[0] for each in FORMATS if each.encode and each.suffixes)
         *most, last = ".txt", *suffixes
         raise UsageError(
-            f"{path}: light files of the type {path.suffix.lower()} are only read",
+            f"{path}: light files of the type {path.suffix.lower()} can be read but not written",
             hint=f"Write {', '.join(most)} or {last}",
         )
     return encode
 
 
 def encode_lights(path: Path, directions: Float64Array, images: Sequence[Path]) -> bytes:
-    """Return a light file of directions (F, 3) of images, in the format that its suffix names; see
+    """Return the content of a light file with the directions (F, 3) of images. See
     light_encoder.
     """
     return light_encoder(path)(directions, images)

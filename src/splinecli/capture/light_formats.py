@@ -1,10 +1,9 @@
 """Readers of light files that are not lines of numbers: RTI's .lp, AliceVision's JSON, Relight's
-.dome, other JSON, and matrices of NumPy, MATLAB and OpenCV. Each returns rows of numbers, some with
-the names of their images.
+.dome, other JSON, and matrices of NumPy, MATLAB and OpenCV.
 
-A reader takes the path, the number of images if it is known, and the meaning of a row. Each raises
-InputError for a file that it cannot read. A file may have several matrices: the lights are the only
-one N x 3 or 3 x N that fits the images.
+A reader takes the path, the number of images if it is known, and the meaning of a row. It returns
+rows of numbers, which may name their images, and raises InputError for a file that it cannot read.
+In a file with several matrices, the lights are the only N x 3 or 3 x N matrix that fits the images.
 """
 
 import json
@@ -33,10 +32,9 @@ from splinecli.system.files import parse_json
 
 
 def read_lp(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
-    """Read RTI's format: the number of lights, then a line `file name x y z` for each. Names may
-    contain spaces.
+    """Read RTI's format: the number of lights, then one line `file name x y z` for each.
 
-    The number may be missing, as other programs leave it out.
+    Names may contain spaces. The number may be missing, because some programs leave it out.
     """
     stored = numbers.read_lines(path, else_latin_1=True)
     content = [(line, text.strip()) for line, text in enumerate(stored, start=1) if text.strip()]
@@ -53,7 +51,7 @@ def read_lp(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
             f"the first line states {count[:40]} lights, but {len(rows)} lines follow",
             path,
             line=first,
-            hint="Correct the number, or restore the missing lines",
+            hint="Correct the number or add the missing lines",
         )
     if not rows:
         raise InputError("the file contains no lights", path, line=first)
@@ -74,9 +72,7 @@ def read_lp(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
 
 
 def read_json_lights(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
-    """Read the lights of a JSON file: a dome of Relight, a list of x y z, or what AliceVision
-    writes.
-    """
+    """Read lights from JSON: a dome of Relight, a list of x y z, or the format of AliceVision."""
     try:
         document = parse_json("\n".join(numbers.read_lines(path)))
     except json.JSONDecodeError as error:
@@ -106,8 +102,7 @@ def _read_alicevision(document: Any, path: Path) -> NumberRows:
     listed = document.get("lights") if isinstance(document, dict) else None
     if not isinstance(listed, list) or not listed:
         raise InputError(
-            'found no list "lights", expected lights as AliceVision writes them,'
-            " or a list of x y z",
+            'found no list "lights", expected the format of AliceVision or a list of x y z',
             path,
         )
     names, vectors, intensities = [], [], []
@@ -136,14 +131,14 @@ _DOME_POSITIONS = ("positions3d", "positionsSphere", "positions")
 
 
 def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
-    """Read a dome of Relight: lights in the order of the images, as objects with x (right), y (up)
-    and z (camera).
+    """Read a dome of Relight: lights in the order of the images, with x (right), y (up) and z
+    (camera).
 
-    Positions are interpreted as lamp positions. ledAdjust, by which Relight multiplies the images,
-    gives intensities.
+    Positions are interpreted as lamp positions. Intensities are derived from ledAdjust, the factors
+    by which Relight multiplies the images.
     """
     if not isinstance(document, dict):
-        raise InputError("found no object, expected a dome as Relight writes it", path)
+        raise InputError("found no JSON object, expected a dome written by Relight", path)
     positions = _DOME_POSITIONS
     if document.get("lightConfiguration") == "spherical":
         positions = ("positionsSphere", "positions3d", "positions")
@@ -151,24 +146,24 @@ def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
     key = next((key for key in keys if document.get(key)), None)
     if key is None:
         raise InputError(
-            f"found no list of {' or '.join(keys)}, expected a dome as Relight writes it", path
+            f"found no list of {' or '.join(keys)}, expected a dome written by Relight", path
         )
     vectors = _vectors(document[key])
     factors = _vectors(document.get("ledAdjust"), "rgb") or []
     if vectors is None or any(len(vector) != 3 for vector in vectors):
-        raise InputError(f'the list "{key}" does not have x, y and z for each light', path)
+        raise InputError(f'the list "{key}" does not contain x, y and z for each light', path)
     usable = all(usable_intensities(np.array(light)).all() for light in factors)
     if factors and not (usable and len(factors) == len(vectors)):
         problem = f'the list "ledAdjust" has {len(factors)} factors for {len(vectors)} lights'
         raise InputError(
-            problem if usable else f'a factor of "ledAdjust" is not {INTENSITY_RANGE}', path
+            problem if usable else f'a factor in "ledAdjust" is not {INTENSITY_RANGE}', path
         )
     return _unnumbered(path, vectors, None, [[1 / factor for factor in light] for light in factors])
 
 
 def _listed(document: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | None:
-    """Return the names and vectors of a list [[x, y, z], ...], of a list of objects, or of an
-    object with each image's light by its name.
+    """Return the names and vectors in [[x, y, z], ...], a list of objects, or a mapping from image
+    names.
     """
     if isinstance(document, dict):
         lists = [values for values in document.values() if _vectors(values) or _objects(values)]
@@ -185,8 +180,9 @@ def _listed(document: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] |
 
 
 def _objects(values: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | None:
-    """Return the names and vectors of a list of objects such as {"file": "a.png", "light_dir": [x,
-    y, z]}; None for anything else.
+    """Return the names and vectors in a list such as [{"file": "a.png", "light_dir": [x, y, z]}].
+
+    None for anything else.
     """
     if isinstance(values, dict) and all(isinstance(each, dict) for each in values.values()):
         values = [{"file": name, **each} for name, each in values.items()]
@@ -204,8 +200,10 @@ def _objects(values: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | 
 
 
 def _light_of(values: dict[str, Any]) -> list[float] | None:
-    """Return the only vector of an object, or the only one called a light or direction; or x, y and
-    z, or azimuth and elevation; None if there is none.
+    """Return the vector of an object; None if it is ambiguous or missing.
+
+    It is the only vector, or else the only one named as a light or direction, or else x, y and z,
+    or azimuth and elevation.
     """
     found = {key: read[0] for key, value in values.items() if (read := _vectors([value]))}
     vectors = {key: vector for key, vector in found.items() if len(vector) == 3}
@@ -222,8 +220,9 @@ def _light_of(values: dict[str, Any]) -> list[float] | None:
 
 
 def _vectors(values: Any, keys: Sequence[str] = "xyz") -> list[list[float]] | None:
-    """Return lists of two numbers or more, or objects with these keys, as lists of numbers; None
-    for anything else.
+    """Return lists of at least two numbers, or objects with these keys, as lists of numbers.
+
+    None for anything else.
     """
     vectors = []
     for each in values if isinstance(values, list) else []:
@@ -242,15 +241,14 @@ def _unnumbered(
     names: Sequence[str] | None,
     intensities: Sequence[Sequence[float]],
 ) -> NumberRows:
-    """Return vectors of a file without lines."""
+    """Return vectors from a file without line numbers as rows."""
     rows = tuple(NumberRow(tuple(vector), None) for vector in vectors)
     given = np.array(intensities, np.float64) if intensities else None
     return NumberRows(path, rows, None if names is None else tuple(names), given, are_vectors=True)
 
 
-# OpenCV's FileStorage; its own reader is C++ that was made for trusted files.
-# No part may match the start of another one: the backtracking would take minutes for a file of 1
-# MB.
+# OpenCV's FileStorage. Its own reader, in C++, was made for trusted files. No part of a pattern may
+# match the start of the next one, because backtracking would take minutes for a file of 1 MB.
 _YAML = re.compile(
     r"^[ \t]*([\w.-]+):\s*!!opencv-matrix\s+rows:\s*(\d{1,9})\s+cols:\s*(\d{1,9})\s+dt:\s*\"?\w+\"?"
     r"\s+data:\s*\[([^][:]*)\]",
@@ -264,16 +262,14 @@ _XML = re.compile(
 
 NEAR_PS = frozenset({"S", "Dir"})  # positions and axes of lamps in a light.mat of near_ps
 _MOST_NAMED = 6  # matrices in a message
-# of a matrix among others, the likeliest first
+# Names of the lights among several matrices, the most likely first
 _LIGHT_NAMES = ("light_directions", "lightdirs", "light_dirs", "lights", "light", "l", "s")
 
 
 def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
-    """Read the rows of the matrix of lights in a file of NumPy, MATLAB or OpenCV; the lines count
-    them from 1.
-    """
+    """Return the rows of the light matrix in a file of NumPy, MATLAB or OpenCV, numbered from 1."""
     suffix = path.suffix.lower()
-    if suffix != ".mat":  # of which only the matrix is read
+    if suffix != ".mat":  # from which only the matrix is read
         numbers.check_text_length(path, numbers.MOST_TEXT)
     if suffix == ".npy":
         array = _read_npy(path)
@@ -297,8 +293,8 @@ def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
 def _choose(
     shapes: Mapping[str, tuple[int, ...]], path: Path, n_images: int | None, form: RowForm
 ) -> str:
-    """Return the name of the matrix N x 3 or 3 x N, of several the one that has a light for each
-    image.
+    """Return the name of the N x 3 or 3 x N matrix; if there are several, the one that fits the
+    images.
     """
     lights = {name: shape for name, shape in shapes.items() if len(shape) == 2 and 3 in shape}
     if len(lights) > 1:
@@ -320,7 +316,7 @@ def _choose(
         f"found {'several matrices' if lights else 'no matrix'} N x 3 or 3 x"
         f" N{f': {named}{more}' if sizes else ''}",
         path,
-        hint="Write the light directions into a text file, a line x y z for each image",
+        hint="Write the light directions into a text file, with one line x y z for each image",
     )
 
 

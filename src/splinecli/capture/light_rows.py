@@ -29,38 +29,35 @@ AXIS_WORDS = {
     "z-camera": (2, 1),
     "z-away": (2, -1),
 }
-"""The words of --light-frame: an axis of the file, and its sign in the usual frame."""
+"""The words of --light-frame, each with an axis of the file and its sign in the usual frame."""
 
 _LEAST, _MOST = 1e-12, 1e12
 INTENSITY_RANGE = f"from {_LEAST:g} to {_MOST:g}"
-"""The range of light intensities. Such numbers and their inverses are within the range of float32.
-"""
+"""The range of light intensities, within which numbers and their inverses fit into float32."""
 
-EXCHANGED = "swap-xy"  # word for files whose first column is y and whose second is x
+EXCHANGED = "swap-xy"  # the word for files whose first column is y and whose second is x
 
 
 @dataclass(frozen=True)
 class LightFrame:
     """The frame of a light file."""
 
-    # of x, y and z, 1 for right, up and to the camera, -1 for left, down, away
+    # of x, y and z: 1 for right, up and to the camera; -1 for left, down and away
     signs: tuple[int, int, int] = (1, 1, 1)
-    # whether the file has y before x. The signs belong to x and y in either order
+    # whether y comes before x in the file. The signs apply to x and y in either order
     exchanged: bool = False
-    # of the file's origin, for positions of lamps
+    # position of the file's origin, for positions of lamps
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def matrix(self) -> Float64Array:
-        """The matrix (3, 3) M with which directions @ M' are in the frame x right, y up, z to the
-        camera.
-        """
+        """The matrix M (3, 3) for which directions @ M' are in the usual frame."""
         order = [1, 0, 2] if self.exchanged else [0, 1, 2]
         return np.diag(self.signs).astype(np.float64)[:, order]
 
     def __str__(self) -> str:
-        """Return the value of --light-frame, such as "x-left,y-down". Axes with their usual
-        direction are left out.
+        """Return the value of --light-frame, such as "x-left,y-down", without axes in their usual
+        direction.
         """
         words = [EXCHANGED] if self.exchanged else []
         words += [word for word, (axis, sign) in AXIS_WORDS.items() if sign == self.signs[axis] < 0]
@@ -74,7 +71,7 @@ class LightFrame:
         return ", ".join(parts)
 
     def after(self, first: LightFrame) -> LightFrame:
-        """Return the composition of `first` and then this frame."""
+        """Return the frame that results from applying `first` and then this frame."""
         x, y, z = (int(sign) for sign in (self.matrix @ first.matrix).sum(axis=1))
         return LightFrame((x, y, z), self.exchanged != first.exchanged)
 
@@ -86,13 +83,13 @@ BOTH_NEGATED = LightFrame((-1, -1, 1))
 PLANE_FRAMES = tuple(
     LightFrame((x, y, 1), exchanged) for exchanged, x, y in product((False, True), (1, -1), (1, -1))
 )
-"""The eight frames with z to the camera; the usual one first."""
+"""The eight frames with z to the camera, starting with the usual one."""
 
 
 def parse_light_frame(text: str | None) -> LightFrame:
-    """Return the frame of a list such as "x-left,y-down,swap-xy"; the usual frame for None.
+    """Return the frame for a list such as "x-left,y-down,swap-xy"; the usual frame for None.
 
-    Axes that are not listed have their usual direction. Raises UsageError for an unknown word or a
+    Axes that are not listed keep their usual direction. Raises UsageError for an unknown word or a
     repeated axis.
     """
     if text is None:
@@ -106,23 +103,23 @@ def parse_light_frame(text: str | None) -> LightFrame:
         if word not in AXIS_WORDS:
             words = ", ".join((*AXIS_WORDS, EXCHANGED))
             raise UsageError(
-                f"--light-frame is {text!r}; expected words of {words}, separated by commas"
+                f"--light-frame is {text!r}, expected one or more of {words}, separated by commas"
             )
         axis, sign = AXIS_WORDS[word]
         if axis in signs:
             raise UsageError(
-                f"--light-frame is {text!r}; {'xyz'[axis]} is listed twice", hint="Leave one out"
+                f"--light-frame is {text!r}, where {'xyz'[axis]} is listed twice",
+                hint="Leave one out",
             )
         signs[axis] = sign
     return LightFrame((signs.get(0, 1), signs.get(1, 1), signs.get(2, 1)), exchanged)
 
 
 LightForm = Literal["xyz", "azel", "slant-tilt"]
-"""The numbers of a light: a vector; azimuth and elevation; or slant and tilt (HALCON). Angles are
-in degrees.
-"""
+"""The numbers that define a light: a vector; azimuth and elevation; or slant and tilt (HALCON).
+Angles are in degrees."""
 
-RowForm = LightForm | Literal["positions"]  # numbers of a row in a file of lights or of near lamps
+RowForm = LightForm | Literal["positions"]  # the numbers in a row of a light file
 
 COLUMNS: dict[RowForm, dict[int, str]] = {
     "xyz": {3: "x y z"},
@@ -136,8 +133,7 @@ AZEL_HINT = "If they are azimuth and elevation in degrees, add --light-format az
 
 
 def directions_from_angles(angles_deg: Float64Array, form: RowForm) -> Float64Array:
-    """Return unit vectors (F, 3) from azimuths and elevations, or slants and tilts (F, 2), in
-    degrees.
+    """Return unit vectors (F, 3) from azimuth and elevation, or slant and tilt (F, 2), in degrees.
 
     Azimuth and tilt are measured from x (right) towards y (up), the elevation from the image plane
     towards the camera, and the slant from the camera axis.
@@ -165,16 +161,13 @@ def check_angles(table: NumberRows, form: RowForm) -> None:
                     f"found slant {first:g} and tilt {second:g}, expected 0 to below 90 and -360"
                     " to 360 degrees"
                 )
-                hint = "The slant counts from the camera axis"
+                hint = "The slant is measured from the camera axis"
             else:
                 problem = (
                     f"found azimuth {first:g} and elevation {second:g}, expected -360 to 360 and"
-                    " above 0 to 90"
+                    " above 0 to 90 degrees"
                 )
-                problem += " degrees"
-                hint = (
-                    "The elevation counts from the image plane: 90 is the direction of the camera"
-                )
+                hint = "The elevation is measured from the image plane, so 90 is towards the camera"
             raise InputError(problem, table.path, line=row.line, hint=hint)
     if np.abs([row.numbers[-2:] for row in table.rows]).max() < 2 * np.pi:
         raise InputError(
@@ -186,22 +179,25 @@ def check_angles(table: NumberRows, form: RowForm) -> None:
 
 
 def zenith_as_elevation(light_directions: Float64Array) -> Float64Array:
-    """Return lights (..., 3) with each light's elevation as its angle from the camera axis."""
+    """Return lights (..., 3) as if their angle from the camera axis had been read as the
+    elevation.
+    """
     level = np.linalg.norm(light_directions[..., :2], axis=-1, keepdims=True)
     across = light_directions[..., :2] / np.maximum(level, 1e-9) * light_directions[..., 2:]
     return np.concatenate((across, level), axis=-1)
 
 
 def lights_of_half_vectors(half_vectors: Float64Array) -> Float64Array:
-    """Return the lights (..., 3) that a mirror with these unit normals reflects towards the
+    """Return the directions (..., 3) of lights that mirrors with these unit normals reflect to the
     camera.
     """
     return 2 * half_vectors[..., 2:] * half_vectors - (0.0, 0.0, 1.0)
 
 
 def refuse_angles(table: NumberRows) -> None:
-    """Raise InputError for rows that are clearly angles: two columns, or with a count, or with one
-    radius for all.
+    """Raise InputError for rows that clearly contain angles.
+
+    They have two columns, or a third one that numbers them or contains the same radius for all.
     """
     rows = [row.numbers for row in table.rows]
     lengths = {len(row) for row in rows}
@@ -215,7 +211,7 @@ def refuse_angles(table: NumberRows) -> None:
             " columns (x y z)"
         )
     elif lengths == {3} and not numbered:
-        # Perhaps all have the same radius. Vectors around an object have y < 0.
+        # Lights from all sides would include vectors with y < 0.
         azimuth, elevation, radius = np.array(rows).T
         in_range = (np.abs(azimuth) <= 360).all() and ((elevation > 0) & (elevation <= 90)).all()
         if np.ptp(radius) == 0 and in_range and elevation.max() > 2 and np.abs(azimuth).max() > 90:
@@ -228,8 +224,8 @@ def refuse_angles(table: NumberRows) -> None:
 
 
 def counts_rows(column: list[float]) -> int | None:
-    """Return the first number of a column that counts the rows in some order, 0 or 1; None for any
-    other column.
+    """Return 0 or 1 if a column numbers the rows from there, in any order; None for any other
+    column.
     """
     first = min(column)
     counts = first in (0, 1) and sorted(column) == [first + place for place in range(len(column))]
@@ -242,18 +238,18 @@ _AXES, _ANGLES, _SLANTS = ("x", "y", "z"), ("az", "el"), ("slant", "tilt")
 
 
 def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
-    """Return the rows of a text file, without "#" comments, blank lines and a header (a first row
-    without numbers).
+    """Return the rows of a text file, without "#" comments, blank lines and a header.
 
-    Rows that begin with a word belong to named images, as "img 1.png 0 0 1": the last numbers are
-    the light. A header that names them, as "z y x" or "elevation azimuth", gives their order.
+    A header is a first row without numbers. If it names the columns, as in "z y x" or "elevation
+    azimuth", they are reordered. Rows that begin with a word belong to named images: in "img 1.png
+    0 0 1", the last numbers are the light.
 
     Args:
-        n_numbers: the number of numbers that follow a name.
+        n_numbers: how many numbers follow a name.
 
     Raises:
         InputError: with the line, for a word that is not a finite number; also for a file without
-            rows, and for a header or rows that are clearly other angles than expected.
+            rows, and for a header or rows that clearly contain unexpected angles.
     """
     rows = read_rows_of_words(path, n_numbers, expected=expected)
     order = list(range(n_numbers))
@@ -290,8 +286,9 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
 
 
 def _order_of(header: list[str]) -> list[int]:
-    """Return the places of x, y and z, azimuth and elevation, or slant and tilt in a header; else
-    the usual places.
+    """Return the positions of x, y and z, azimuth and elevation, or slant and tilt in a header.
+
+    For any other header, return the usual order.
     """
     words = [word.lower().strip("\"'") for word in header]
     for pattern, wanted in (
@@ -318,7 +315,7 @@ def _reordered(table: NumberRows, order: list[int]) -> NumberRows:
 
 
 def image_name(text: str, numbers: list[str]) -> str:
-    """Return the image name before the last numbers of a row, without folders, quotes and
+    """Return the image name in a row that ends with numbers, without folders, quotes and
     separators.
     """
     for word in reversed(numbers):
@@ -327,5 +324,5 @@ def image_name(text: str, numbers: list[str]) -> str:
 
 
 def usable_intensities(values: Float64Array) -> Bools:
-    """Return which values are within INTENSITY_RANGE."""
+    """Return a boolean array, true for values within INTENSITY_RANGE."""
     return (values >= _LEAST) & (values <= _MOST)

@@ -1,5 +1,5 @@
-"""Find the lights of a capture: by the usual names of light files, in the folders where people keep
-them, and in the names of the images.
+"""Find the lights of a capture: in light files with usual names, in nearby folders, and in the
+names of the images.
 """
 
 import re
@@ -33,22 +33,23 @@ _SUFFIXES = {".txt", *(suffix for each in FORMATS for suffix in each.suffixes)}
 _OTHER_FILES = re.compile("intens|camera|filenames|lobes|position|calibration|normal")
 _LIGHTS = r"(.*[^a-z])?light(s|ing)?[^a-z]*(dirs?|directions?|vec(tor)?s?|sources?|matrix)?[^a-z]*"
 _LIGHT_FOLDER = re.compile(rf"{_LIGHTS}|lamps?|leds?|lp")
-_MOST_FILES = 50  # of a folder that are tried
+_MOST_FILES = 50  # largest number of files that are tried in a folder
 
 
 class NoLightsError(InputError):
-    """No lights of a capture are found."""
+    """No lights of a capture were found."""
 
 
 def light_names() -> str:
-    """Return all names of light files that are found, for messages."""
+    """Return the names under which light files are found, for messages."""
     names = [name for each in FORMATS for name in each.found]
     return f"{', '.join(names)} or {LIGHT_POSITIONS[0]}"
 
 
 def find_light_file(folder: Path) -> Path | None:
-    """Return the light file in the folder; None if there is none. Raises InputError for several
-    where none is the usual one.
+    """Return the light file with a usual name in the folder; None if there is none.
+
+    Raises InputError for several files of the same rank above 0.
     """
     for rank, group in groupby(_usual(folder), lambda found: found[0]):
         paths = [path for _, path in group if is_found_file(path)]
@@ -64,9 +65,7 @@ def find_light_file(folder: Path) -> Path | None:
 
 
 def _usual(folder: Path) -> Iterator[tuple[int, Path]]:
-    """Yield the entries of a folder with usual names of light files, each with its rank, in order
-    of precedence.
-    """
+    """Yield the entries with usual names of light files and their ranks, in order of precedence."""
     entries = list_folder(folder)
     for rank in sorted({each.rank for each in FORMATS}):
         for name in (name for each in FORMATS if each.rank == rank for name in each.found):
@@ -76,12 +75,12 @@ def _usual(folder: Path) -> Iterator[tuple[int, Path]]:
 def search_lights(
     folder: Path, images: Sequence[Path]
 ) -> tuple[Path | None, tuple[CaptureWarning, ...]]:
-    """Return the lights of a capture without a usual light file, and a warning that says which they
-    are: a light file that fits its images, or their folder if their names contain lights; None if
-    there is none.
+    """Return the lights of a capture without a usual light file, and a warning that names them.
 
-    The file is in the folder, in one called Lights inside it or beside it, or in the folder around
-    it. Raises InputError if several files there fit and differ.
+    A light file that fits the images is searched for in the folder, in a folder called Lights
+    inside it or next to it, and in the parent folder. If the names of the images contain lights,
+    their folder is returned. None if nothing is found. Raises InputError if several files fit and
+    differ.
     """
     stored, of_images = page_of(images[0])[0], images[0].parent
     if stored.suffix.lower() == ".mat" and _fit(stored, images) is not None:
@@ -93,12 +92,12 @@ def search_lights(
         path, *_ = fits
         if not all(np.array_equal(fits[path], other, equal_nan=True) for other in fits.values()):
             raise InputError(
-                f"found {len(fits)} files that may be its lights: {short_list([*fits])}",
+                f"found {len(fits)} files that fit the images: {short_list([*fits])}",
                 path.parent,
                 hint="Choose one with --lights FILE",
             )
         return path, _found(path)
-    for path in _candidates(folder):  # of any name, if they name the images
+    for path in _candidates(folder):  # with any name, if they name the images
         if _fit(path, images, named=True) is not None:
             return path, _found(path)
     if (named := lights_in_names(images)) is not None:
@@ -106,17 +105,17 @@ def search_lights(
     return None, ()
 
 
-def _found(what: object) -> tuple[CaptureWarning, ...]:
-    text = f"The light directions were read from {what}. Give --lights FILE for others."
+def _found(source: object) -> tuple[CaptureWarning, ...]:
+    text = f"The light directions were read from {source}. To use others, pass --lights FILE."
     return (CaptureWarning(LIGHTS_FOUND, text),)
 
 
 def _places(folder: Path, of_images: Path) -> Iterator[list[Path]]:
-    """Yield the files of each place that may be light files, the nearest first."""
+    """Yield the possible light files of each place, the nearest place first."""
     near = dict.fromkeys((folder, of_images))
     yield [path for each in near for path in _likely(each)]
     above = folder.absolute().parent
-    with suppress(InputError):  # we may lack permission to read the folder above
+    with suppress(InputError):  # the parent may be unreadable
         for around in dict.fromkeys((folder, of_images, above)):
             yield [path for each in light_folders(around) for path in _candidates(each)]
         name, entries = folder_name(folder).lower(), list_folder(above)
@@ -126,25 +125,27 @@ def _places(folder: Path, of_images: Path) -> Iterator[list[Path]]:
 
 
 def light_folders(folder: Path) -> list[Path]:
-    """Return the subfolders that are called Lights or similarly, and contain no images."""
+    """Return the subfolders called Lights or similarly that contain no images."""
     named = [each for each in list_folder(folder) if _LIGHT_FOLDER.fullmatch(each.name.lower())]
     return [each for each in named if is_folder(each) and not list_images(each)]
 
 
 def has_lights(folder: Path) -> bool:
-    """Return whether a folder has files or folders with the names of lights."""
+    """Return whether a folder contains files or folders with typical names of lights."""
     return bool(_likely(folder) or light_folders(folder))
 
 
 def _likely(folder: Path) -> list[Path]:
-    """Return the files of a folder whose names are those of light files."""
+    """Return the files in a folder that have typical names of light files."""
     usual = {path for _, path in _usual(folder)}
     files = _candidates(folder)
     return [p for p in files if p in usual or re.fullmatch(_LIGHTS, p.stem.lower())]
 
 
 def _candidates(folder: Path) -> list[Path]:
-    """Return the files of a folder with suffixes of light files, without those of other names."""
+    """Return the files in a folder with the suffix of a light file, except files with another
+    role.
+    """
     files = [
         path
         for path in list_folder(folder)
@@ -163,14 +164,15 @@ def _fit(
     by_order: bool = False,
     named: bool = False,
 ) -> Float64Array | None:
-    """Return the lights (F, 3) of a file in the order of the images, with NaN for images without
-    one; None if it does not fit them.
+    """Return the lights (F, 3) of a file in the order of the images; None if they do not match.
+
+    Images without a light have NaN.
 
     Args:
-        by_order: whether it may name other images.
-        named: whether it must name images.
+        by_order: whether the file may name other images.
+        named: whether the file must name its images.
     """
-    longest = min(numbers.MOST_TEXT, 20_000 + 500 * len(images))  # others take seconds to read
+    longest = min(numbers.MOST_TEXT, 20_000 + 500 * len(images))  # longer files take seconds
     with suppress(InputError, OSError):
         if path.suffix.lower() != ".mat" and path.stat().st_size > longest:
             return None
@@ -189,8 +191,8 @@ def _fit(
 
 
 def light_option(folders: Sequence[Path], images: Sequence[Path]) -> str | None:
-    """Return the options that read a file in one of the folders as lights;
-    None for no such file.
+    """Return the options for reading a file in one of the folders as lights; None if no file
+    fits.
     """
     for folder in folders:
         with suppress(InputError, OSError):

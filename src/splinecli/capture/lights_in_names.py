@@ -1,7 +1,7 @@
 """Light directions in the names of images: angles as in the Yale Face Database B, x and y, or sides
 such as left and top.
 
-The folder of the images takes the place of a light file. Its rows name their images.
+The folder of the images is used as a light file whose rows name their images.
 """
 
 import math
@@ -19,14 +19,14 @@ from splinecli.maths import Float64Array
 from splinecli.maths.robust import MIN_LIGHTS
 
 _NUMBER = r"[-+]?\d+(?:\.\d+)?"
-_LEAST_SHARE = 0.8  # of the images whose names must have a light
+_LEAST_SHARE = 0.8  # smallest share of the images with a light in their names
 _ELEVATION_OF_SIDES_DEG = 45.0
 
 Rows = dict[Path, tuple[float, float, float]]
 
 
 def _numbers(pattern: str, images: Sequence[Path]) -> tuple[list[Path], Float64Array]:
-    """Return the images whose stems match a pattern, and the numbers of its groups (F, N)."""
+    """Return the images whose stems match a pattern, and the numbers in its groups (F, N)."""
     found = [(image, match) for image in images if (match := re.search(pattern, image.stem, re.I))]
     numbers = [list(map(float, match.groups())) for _, match in found]
     return [image for image, _ in found], np.array(numbers, np.float64)
@@ -37,7 +37,7 @@ def _rows(images: Sequence[Path], vectors: Float64Array) -> Rows:
 
 
 def _yale(images: Sequence[Path]) -> tuple[Rows, str]:
-    """Read A+035E+40: positive azimuths are to the right of the subject, so left in the image."""
+    """Read names such as A+035E+40, in which positive azimuths are on the left of the image."""
     found, angles = _numbers(r"A([-+]\d{1,3})_?E([-+]\d{1,2})(?!\d)", images)
     azimuth, elevation = np.radians(angles.reshape(-1, 2)).T
     level = np.cos(elevation)
@@ -47,7 +47,7 @@ def _yale(images: Sequence[Path]) -> tuple[Rows, str]:
 
 
 def _angles(images: Sequence[Path]) -> tuple[Rows, str]:
-    """Read azimuth and elevation, or tilt and slant, with their names: az045_el30."""
+    """Read azimuth and elevation, or tilt and slant, with their names, as in az045_el30."""
     azimuth, zenith = "az[a-z]*|phi|tilt|pan", "slant|theta|zen[a-z]*|polar|incl[a-z]*"
     forms: tuple[tuple[str, str, RowForm], ...] = (
         (azimuth, "el[a-z]*|alt[a-z]*", "azel"),
@@ -62,12 +62,12 @@ def _angles(images: Sequence[Path]) -> tuple[Rows, str]:
 
 
 def _xy(images: Sequence[Path]) -> tuple[Rows, str]:
-    """Read x and y, or x, y and z: NAME_-0.5_1.0."""
+    """Read x and y, or x, y and z, as in NAME_-0.5_1.0."""
     start, between = r"(?:^|[ _,(=x])", r"[ _,=yz]{1,3}"
     for count in (3, 2):
         pattern = start + between.join(count * [f"({_NUMBER})"]) + r"\)?$"
         found, vectors = _numbers(pattern, images)
-        if not found or not (vectors[:, :2].min(axis=0) < 0).all():  # such as numbers of rows
+        if not found or not (vectors[:, :2].min(axis=0) < 0).all():  # for example counters
             continue
         if count == 3:
             return _rows(found, vectors), "x, y and z"
@@ -94,7 +94,9 @@ _SIDE = re.compile(rf"(?<![a-z])((?:(?:{'|'.join(_SIDE_OF)})[ _-]?)+)(?![a-z])")
 
 
 def _sides(images: Sequence[Path]) -> tuple[Rows, str]:
-    """Read left, right, top, bottom and front, also two of them: the rest of the names is equal."""
+    """Read left, right, top, bottom and front, or two of them, in names that are otherwise
+    equal.
+    """
     rows, rests = Rows(), set[str]()
     for image in images:
         stem = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", image.stem).lower()
@@ -119,11 +121,10 @@ _READERS: tuple[Callable[[Sequence[Path]], tuple[Rows, str]], ...] = (_yale, _an
 
 
 def lights_in_names(images: Sequence[Path]) -> tuple[Rows, str] | None:
-    """Return the light of each image in whose name there is one, and what the names contain; None
-    if the names of too few have one.
+    """Return the lights in the names of images, and a description of these names.
 
-    Frame: x right, y up, z to the camera. Vectors have any length, and may be behind the image
-    plane.
+    None if too few names contain a light. Frame: x right, y up, z to the camera. Vectors have any
+    length, and may point behind the image plane.
     """
     for read in _READERS:
         rows, text = read(images)
@@ -134,7 +135,7 @@ def lights_in_names(images: Sequence[Path]) -> tuple[Rows, str] | None:
 
 
 def read_names(folder: Path, n_images: int | None, form: RowForm) -> NumberRows:
-    """Return the lights in the names of the images of a folder. Raises InputError for none."""
+    """Return the lights in the names of a folder's images. Raises InputError if there are none."""
     found = lights_in_names(list_images(folder))
     if found is None:
         raise InputError("found no lights in the names of the images", folder)

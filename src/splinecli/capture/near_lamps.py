@@ -1,5 +1,5 @@
-"""Lamps at arm's length: their positions, the scale that relates pixels to the unit of the
-positions, their files, and checks that the positions are plausible.
+"""Lamps at arm's length: their positions, the size of a pixel in the same unit, their files, and
+checks that the positions are plausible.
 
 The frame is the same as for light directions: x right, y up, z to the camera. The origin is on the
 object's mean plane, at the centre of the image. Positions may be in any unit, such as millimetres.
@@ -34,10 +34,10 @@ from splinecli.system.files import is_found_file, is_substitution
 
 @dataclass(frozen=True, eq=False)
 class NearLamps:
-    """F lamps as points of light, over an image of known scale.
+    """F lamps, modelled as point lights, above an image of known scale.
 
-    Raises InputError if a position is not finite or not in front of the object, or the pixel size
-    is not above 0.
+    Raises InputError if a position is not finite or not in front of the object, or if the pixel
+    size is not above 0.
     """
 
     positions: Float64Array  # (F, 3), in any unit, in front of the object's mean plane (z > 0)
@@ -45,16 +45,16 @@ class NearLamps:
     pixel_size: float
     # row and column of the origin, in pixels of the window that was read
     middle: tuple[float, float]
-    # (F,), the distances along each lamp's axis at which the observations' light intensities hold.
-    # See `of`
+    # (F,), the distances along the lamps' axes at which the light intensities are valid. See `of`
     reference_distances: Float64Array
     # (3, 3) in pixels, as in OpenCV. None assumes an orthographic camera
     camera_matrix: Float64Array | None = None
-    # (P, 3), the surface in the pixels, in this unit; None if unknown
+    # (P, 3), the surface points at the pixels, in the unit of the positions; None if unknown
     points: Float32Array | None = None
-    # (F, 4), for each lamp its axis, a unit vector towards the object, and mu: at an angle a to the
-    # axis, its intensity is cos(a)^mu, the model of an LED (Quéau et al., LED-based photometric
-    # stereo, JMIV 2018, section 2.1). None for lamps that emit equally in all directions
+    # (F, 4), the axis of each lamp, a unit vector towards the object, and its exponent mu. At an
+    # angle a to the axis, the intensity is cos(a)^mu, as in the model of an LED (Quéau et al.,
+    # LED-based photometric stereo, JMIV 2018, section 2.1). None for lamps that emit equally in
+    # all directions
     lobes: Float64Array | None = None
 
     def __post_init__(self) -> None:
@@ -77,12 +77,12 @@ class NearLamps:
         camera_matrix: Float64Array | None = None,
         lobes: Float64Array | None = None,
     ) -> NearLamps:
-        """Return lamps at positions (F, 3) over whole images of this shape (H, W).
+        """Return lamps at positions (F, 3) above whole images of this shape (H, W).
 
         Args:
             equal: whether the light intensities are unknown, so that all lamps are assumed to be
-                equally bright along their axes. Otherwise each intensity holds at the origin, where
-                a gray card would measure it.
+                equally bright along their axes. Otherwise, the intensities are valid at the origin,
+                where a gray card would be measured.
         """
         distances = np.linalg.norm(positions, axis=1)
         if equal:
@@ -96,8 +96,10 @@ class NearLamps:
     def within(
         self, left: float, top: float, step: int, camera_matrix: Float64Array | None
     ) -> NearLamps:
-        """Return the lamps over every step-th pixel from (left, top) on, with the camera matrix of
-        these pixels.
+        """Return the lamps for a window of the image that starts at (left, top) and has every
+        step-th pixel.
+
+        The camera matrix is in pixels of the window.
         """
         middle = (self.middle[0] - top) / step, (self.middle[1] - left) / step
         return replace(
@@ -105,7 +107,7 @@ class NearLamps:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the lamps as JSON values: their distances from the origin, and the scale."""
+        """Return the distances from the origin, scale, camera and lobes as JSON values."""
         return {
             "distances": np.linalg.norm(self.positions, axis=1).round(4).tolist(),
             "pixel_size": self.pixel_size,
@@ -115,13 +117,13 @@ class NearLamps:
         }
 
     def turned(self, directions: Float64Array) -> NearLamps:
-        """Return the lamps at the same distances from the origin, in other directions (F, 3)."""
+        """Return the lamps in other directions (F, 3), at the same distances from the origin."""
         return replace(
             self, positions=directions * np.linalg.norm(self.positions, axis=1, keepdims=True)
         )
 
     def choose_lights(self, positions: Sequence[int]) -> NearLamps:
-        """Return some of the lamps, in the order given."""
+        """Return a selection of the lamps, in the given order."""
         chosen = list(positions)
         return replace(
             self,
@@ -131,31 +133,29 @@ class NearLamps:
         )
 
     def choose_pixels(self, rows: slice | Integers) -> NearLamps:
-        """Return the lamps with the surface in some of the pixels."""
+        """Return the lamps with the surface points of a selection of the pixels."""
         return self if self.points is None else replace(self, points=self.points[rows])
 
     def plane_points(self, rows: NDArray[np.number], columns: NDArray[np.number]) -> Float64Array:
-        """Return the points (N, 3) of the object's mean plane at rows and columns (N,) of the
-        image.
-        """
+        """Return points (N, 3) on the object's mean plane, from image rows and columns (N,)."""
         middle_row, middle_column = self.middle
         across, up = columns - middle_column, middle_row - rows
         return np.stack((across, up, np.zeros(len(rows))), axis=1) * self.pixel_size
 
     def extent(self, mask: Bools) -> tuple[tuple[float, float], Float64Array]:
-        """Return width and height of the rectangle around the mask (H, W), and its middle (3,) on
-        the mean plane.
+        """Return the size and the centre of the mask's bounding box on the object's mean plane.
+
+        The size is (width, height), and the centre is a point (3,).
         """
         rows, columns = bounds(mask)
         width, height = (float(np.ptp(places) + 1) * self.pixel_size for places in (columns, rows))
         return (width, height), self.plane_points(rows.mean()[None], columns.mean()[None])[0]
 
     def angles_across_deg(self, mask: Bools) -> Float64Array:
-        """Return the largest deviation of each lamp's direction (F,) from its direction at the
-        middle of the object.
+        """Return by how much the direction of each lamp (F,) changes across the object, in degrees.
 
-        Only the corners of the rectangle around the mask (H, W) are compared, as points of the mean
-        plane.
+        This is the largest angle between the direction at the centre of the mask's bounding box and
+        at its corners, all on the object's mean plane.
         """
         rows, columns = bounds(mask)
         row, column = np.meshgrid([*rows, rows.mean()], [*columns, columns.mean()])
@@ -163,10 +163,10 @@ class NearLamps:
         return np.asarray(angle_between_deg(directions, directions[-1]).max(axis=0))
 
     def light_at(self, points: Floats) -> tuple[Float32Array, Float32Array]:
-        """Return the light at points (P, 3): unit directions (P, F, 3), and attenuations (P, F).
+        """Return the light at points (P, 3) as unit directions (P, F, 3) and attenuations (P, F).
 
-        The attenuation is the inverse square of the distance, relative to the light at the lamp's
-        reference distance, times the lamp's lobe.
+        The attenuation follows the inverse square of the distance, relative to the lamp's reference
+        distance, and is multiplied by the lamp's lobe.
         """
         towards = (self.positions - np.asarray(points, np.float64)[:, None]).astype(np.float32)
         distance = np.sqrt(np.einsum("pfc,pfc->pf", towards, towards))
@@ -178,25 +178,27 @@ class NearLamps:
 
 
 def _within_lobes(lobes: Float64Array, towards: Floats) -> Float32Array:
-    """Return the lamps' intensities (P, F) at points in unit directions (P, F, 3) to the lamps;
-    along the axes 1.
+    """Return the intensities (P, F) of lamps relative to their axes, at points in unit directions
+    (P, F, 3) to the lamps.
     """
     cosines = np.einsum("pfc,fc->pf", towards, -lobes[:, :3])
-    # Observations are divided by the lobe, and so is their noise. Outside, a pixel looks shadowed.
+    # Dividing observations by the lobe amplifies noise, so small values are clipped. A pixel
+    # outside the lobe then looks shadowed.
     return np.asarray(cosines.clip(min=0) ** lobes[:, 3], np.float32).clip(min=0.05)
 
 
 UNIT_HINT = (
-    "Give all lengths in one unit, such as millimetres: the lamps' positions or distance, and the"
+    "Use one unit, such as millimetres, for all lengths: the lamps' positions or distance, and the"
     " pixel size or object width"
 )
 
 
 def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> list[CaptureWarning]:
-    """Warn about implausible lamps over an object with this mask (H, W), from a file of positions,
-    if any.
+    """Return warnings about implausible distances between the lamps and an object with this mask
+    (H, W).
 
-    Raises InputError if a lamp would be inside the object or hide it from the camera.
+    The file of positions is named in errors. Raises InputError if a lamp would be inside the
+    object.
     """
     sizes, middle = lamps.extent(mask)
     distances = np.linalg.norm(lamps.positions - middle, axis=1)
@@ -206,10 +208,10 @@ def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> li
         f" {sizes[0]:.3g} wide"
     )
     if distances[nearest] < 0.5 * min(sizes):
-        raise InputError(f"{text}: it would be inside the object", positions, hint=UNIT_HINT)
+        raise InputError(f"{text}, so it would be inside", positions, hint=UNIT_HINT)
     if distances[nearest] < max(sizes):
         problem = "A lamp is very near"
-    # A position in metres instead of millimetres changes the distance a thousandfold.
+    # Confusing metres with millimetres changes the distance by a factor of 1000.
     elif distances[nearest] > 300.0 * max(sizes):
         problem = "The lamps are so far away that their light is parallel"
     else:
@@ -220,31 +222,30 @@ def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> li
 def distant_lights(
     positions: Path | None, lamps: NearLamps | None, mask: Bools
 ) -> list[CaptureWarning]:
-    """Warn that lights are treated as distant over a mask (H, W), although a file has their
-    positions.
+    """Return a warning if lights are treated as distant although a file contains their positions.
 
-    The lamps of the file are None if their scale is unknown.
+    `lamps` are the lamps of this file; None if their scale is unknown. The mask is (H, W).
     """
     name = "the lamps' positions" if positions is None else positions.name
     if lamps is None:
         text = (
-            f"{name} is not used, because the size of a pixel is unknown. Give --pixel-size or"
+            f"{name} is not used, because the size of a pixel is unknown. Add --pixel-size or"
             " --object-width."
         )
         return [CaptureWarning(NEAR_LAMPS, text)]
     if (angle_deg := lamps.angles_across_deg(mask).max()) <= 2.0:
         return []
     text = (
-        f"The lamps are near: by {name}, a light direction changes by up to {angle_deg:.0f}"
-        " degrees between the middle and the edge of the object, but the lights are treated as"
-        " distant. Use --light-positions instead of --lights."
+        f"The lights are treated as distant, but the lamps are near: according to {name}, a light"
+        f" direction changes by up to {angle_deg:.0f} degrees between the middle and the edge of"
+        " the object. Use --light-positions instead of --lights."
     )
     return [CaptureWarning(NEAR_LAMPS, text)]
 
 
 def positions_as_directions(path: Path) -> list[CaptureWarning]:
-    """Warn about a text file of light directions whose vectors have lengths as positions of lamps
-    have.
+    """Return a warning if the vectors of a text file of directions have lengths typical of
+    positions.
     """
     if is_substitution(path) or format_of(path).read != FORMATS[0].read:
         return []
@@ -257,28 +258,28 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
     if len(lengths) < 3 or lengths.min() < 3.0 or lengths.max() < 1.02 * lengths.min():
         return []
     text = (
-        f"The vectors of {path.name} have lengths from {lengths.min():.4g} to {lengths.max():.4g},"
-        " as positions of lamps have, but are read as directions. If they are positions, use"
-        " --light-positions."
+        f"{path.name} is read as light directions, but its vectors have lengths from"
+        f" {lengths.min():.4g} to {lengths.max():.4g}, which is typical of lamp positions. If they"
+        " are positions, use --light-positions."
     )
     return [CaptureWarning(NEAR_LAMPS, text)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class LampOptions:
-    """The user's options for near lamps and the camera. All lengths have the same unit, such as
+    """The user's options for near lamps and the camera. All lengths are in one unit, such as
     millimetres.
 
     Raises UsageError if two options cannot be used together.
     """
 
     positions: str | None = None  # a file of lamp positions, which replaces the light file
-    distance: float | None = None  # of all lamps from the middle of the object, in their directions
+    distance: float | None = None  # from the middle of the object to every lamp
     pixel_size: float | None = None  # the width of a pixel on the object's mean plane
-    # whether the pixel size is given for the surface, so that it needs no lamps
+    # whether the pixel size is also used to scale the surface, and so is valid without lamps
     scales_surface: bool = False
     object_width: float | None = None  # from the first to the last column of the mask
-    camera_matrix: str | None = None  # a file of the 3 x 3 camera matrix in pixels
+    camera_matrix: str | None = None  # a file with the 3 x 3 camera matrix in pixels
 
     def __post_init__(self) -> None:
         for one, other in (("positions", "distance"), ("pixel_size", "object_width")):
@@ -295,9 +296,7 @@ class LampOptions:
 
     @property
     def given(self) -> str | None:
-        """The first option for lamps alone that is given, as the user writes it; None if there is
-        none.
-        """
+        """The first option that needs near lamps, as the user wrote it; None if there is none."""
         names = [name for name in _OPTIONS if not (name == "pixel_size" and self.scales_surface)]
         return next((_OPTIONS[name] for name in names if getattr(self, name) is not None), None)
 
@@ -313,7 +312,7 @@ NO_LAMP_OPTIONS = LampOptions()
 
 
 class Lit(Protocol):
-    """The properties of images that near lamps need, such as a CaptureSource."""
+    """The properties of a source that near lamps depend on."""
 
     @property
     def n_lights(self) -> int: ...
@@ -331,21 +330,20 @@ class Lit(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class LampFiles:
-    """Near lamps as given by files and options, before the lights and the images are read."""
+    """Near lamps as described by files and options, before the lights and the images are read."""
 
     # the file of positions, or None if `distance` puts the lamps in the light directions
     positions: Path | None
     options: LampOptions
-    # of the options or of a file. Neither this nor the object's width is given if the scale is
-    # unknown
+    # from the options or a file. If the scale is unknown, this and the object's width are None
     pixel_size: float | None
     lobes: Path | None  # the file of the lamps' lobes, or None
-    stamp: tuple[Any, ...]  # of the files that were found, from before they were read
+    stamp: tuple[Any, ...]  # of the files that were found, computed before they were read
     # whether the capture uses the lamps. If not, they are only compared with distant lights
     used: bool
 
     def in_words(self) -> str:
-        """Return a description of the source of the lamps' positions."""
+        """Return a description of the lamps and of their source."""
         if not self.used:
             return f"{self.positions} is not used"
         text = f"near, as in {self.positions}"
@@ -358,8 +356,8 @@ class LampFiles:
         return text if self.lobes is None else f"{text}; lobes as in {self.lobes}"
 
     def over(self, source: Lit, mask: Bools, *, step: int = 1) -> NearLamps | None:
-        """Return all lamps over a mask (H, W) of every step-th row and column; None without a
-        scale.
+        """Return all lamps for a mask (H, W) of every step-th row and column; None if the scale is
+        unknown.
 
         Raises InputError.
         """
@@ -367,11 +365,15 @@ class LampFiles:
         if self.positions is not None:
             positions = read_light_positions(self.positions, source.n_lights, source.light_frame)
         else:
-            assert self.options.distance is not None  # without positions, it makes them
+            assert self.options.distance is not None
             positions = source.light_directions * self.options.distance
         # float32 holds the squares of distances up to 1e19.
         if (farthest := np.abs(positions).max(initial=0)) > 1e15:
-            raise InputError(f"a lamp is {farthest:.3g} away", self.positions, hint=UNIT_HINT)
+            raise InputError(
+                f"a lamp is {farthest:.3g} away, expected at most 1e15",
+                self.positions,
+                hint=UNIT_HINT,
+            )
         pixel_size = self.pixel_size
         if self.options.object_width is not None:
             _, (first, last) = bounds(mask)
@@ -396,14 +398,14 @@ class LampFiles:
 
 
 def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampFiles | None:
-    """Return the near lamps given by the capture's folder and the options; None without any.
+    """Return the near lamps described by the capture's folder and the options; None without any.
 
-    A file of positions in the folder is used, unless the user names a file `lights` of distant
-    lights. Beside such a file, or if the scale is unknown, positions are found but not used.
+    A file of positions in the folder is used unless the user passes `lights`, a file of distant
+    lights. If `lights` is given or the scale is unknown, the positions are returned but not used.
 
     Raises:
-        InputError: a file is wrong, or positions are the only lights and their scale is unknown.
-        UsageError: an option needs positions, and there are none.
+        InputError: a file is invalid, or positions are the only lights and their scale is unknown.
+        UsageError: an option needs positions, but none are given.
     """
     positions, used = _path(options.positions), True
     if positions is None and options.distance is None:
@@ -418,8 +420,8 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
             if options.given is None:
                 return None
             raise UsageError(
-                f"{options.given} concerns near lamps, and {folder} has no {LIGHT_POSITIONS[0]}",
-                hint="Add --light-positions FILE or --light-distance D, or leave it out",
+                f"{options.given} needs near lamps, but {folder} has no {LIGHT_POSITIONS[0]}",
+                hint="Add --light-positions FILE or --light-distance D, or leave the option out",
             )
     scaled = options.pixel_size is not None or options.object_width is not None
     pixel_file = None if scaled else _find("pixel_size.txt", folder, positions)
@@ -432,11 +434,11 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
     only = find_light_file(folder), _path(options.positions), lobes
     if used and not scaled and positions in only:
         hint = (
-            "Give --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
+            "Add --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
         )
         if positions == lobes:
             hint = (
-                "Give --pixel-size: the distance from the camera to the object, divided by the"
+                "Add --pixel-size: the distance from the camera to the object divided by the"
                 " focal length in pixels (K(1,1) in camera.mat)"
             )
         raise InputError("the scale of the lamp positions is unknown", positions, hint=hint)
@@ -446,10 +448,9 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
 def find_camera(
     folder: Path, lamps: LampFiles | None, options: LampOptions
 ) -> tuple[Float64Array | None, tuple[Any, ...]]:
-    """Return the camera matrix (3, 3) of whole images, None for an orthographic camera, and the
-    stamp of its file.
+    """Return the camera matrix (3, 3) of whole images and the stamp of its file.
 
-    Raises InputError if the file is wrong.
+    The matrix is None for an orthographic camera. Raises InputError if the file is invalid.
     """
     beside = None if lamps is None else lamps.positions
     path = _path(options.camera_matrix) or _find("camera_matrix.txt", folder, beside)
@@ -457,7 +458,7 @@ def find_camera(
         path = find_named(beside.parent, ["camera.mat"])
     if path is None:
         return None, ()
-    stamp = stamp_content(path)  # before it is read
+    stamp = stamp_content(path)  # computed before the file is read
     return read_camera_matrix(path), (stamp,)
 
 
@@ -466,7 +467,9 @@ def _path(name: str | None) -> Path | None:
 
 
 def read_camera_matrix(path: Path) -> Float64Array:
-    """Return the camera matrix (3, 3) of a text file, or K of a .mat file. Raises InputError."""
+    """Return the camera matrix (3, 3) from a text file, or from K in a .mat file. Raises
+    InputError.
+    """
     if path.suffix.lower() == ".mat":
         matrix: Float64Array = np.asarray(_matrix_of(path, "K"), np.float64)
     else:
@@ -482,9 +485,10 @@ def read_camera_matrix(path: Path) -> Float64Array:
 
 
 def _read_lobes(path: Path, positions: Float64Array, frame: LightFrame) -> Float64Array:
-    """Return the lobes (F, 4) of NearLamps for lamps at positions (F, 3). Raises InputError."""
+    """Return the lobes (F, 4) of lamps at positions (F, 3), as in NearLamps. Raises InputError."""
     hint = (
-        "A line has the direction in which a lamp shines most, x y z, and its exponent mu, 0 to 100"
+        "Each line has the direction x y z in which a lamp is brightest, and its exponent mu from"
+        " 0 to 100"
     )
     if is_near_ps(path):
         columns = np.column_stack((_rows_of(path, "Dir"), _rows_of(path, "mu", 1)))
@@ -509,14 +513,15 @@ def _read_lobes(path: Path, positions: Float64Array, frame: LightFrame) -> Float
             f"lamp {lamp + 1} shines away from the object",
             path,
             line=rows[lamp].line,
-            hint="The directions point from the lamps to the object",
+            hint="The directions must point from the lamps to the object",
         )
     return lobes
 
 
 def is_near_ps(path: Path) -> bool:
-    """Return whether a file is a light.mat of near_ps (Y. Quéau): positions S and axes Dir of
-    lamps, in the frame of OpenCV's camera.
+    """Return whether a file is a light.mat of near_ps (Y. Quéau).
+
+    It contains the positions S and the axes Dir of lamps, in the frame of OpenCV's camera.
     """
     with suppress(InputError):
         return path.suffix.lower() == ".mat" and is_found_file(path) and {"S", "Dir"} <= names(path)
@@ -533,7 +538,7 @@ def _matrix_of(path: Path, name: str) -> Array:
 
 
 def _rows_of(path: Path, name: str, n_columns: int = 3) -> Float64Array:
-    """Return a matrix (F, n_columns) of a .mat file, which may also be transposed."""
+    """Return a matrix (F, n_columns) from a .mat file, which may contain its transpose."""
     matrix = np.asarray(_matrix_of(path, name), np.float64)
     return matrix if matrix.shape[1] == n_columns else matrix.T
 
@@ -541,15 +546,16 @@ def _rows_of(path: Path, name: str, n_columns: int = 3) -> Float64Array:
 def near_ps_frame(
     lamps: LampFiles, camera_matrix: Float64Array | None, shape: Sequence[int]
 ) -> LightFrame:
-    """Return the frame of the positions of near_ps over images of this shape (H, W).
+    """Return the frame of near_ps positions for images of shape (H, W).
 
     Raises InputError without a camera matrix or a pixel size.
     """
     if camera_matrix is None or lamps.pixel_size is None:
         raise InputError(
-            "found positions relative to the camera, expected its matrix and the size of a pixel",
+            "the positions are relative to the camera, so its matrix and the size of a pixel are"
+            " needed",
             lamps.positions,
-            hint="Give --camera-matrix and --pixel-size",
+            hint="Add --camera-matrix and --pixel-size",
         )
     (fx, _, cx), (_, fy, cy), _ = camera_matrix
     distance = lamps.pixel_size * fx
@@ -559,8 +565,9 @@ def near_ps_frame(
 
 
 def near_ps_intensities(path: Path, frame: LightFrame) -> Float64Array | None:
-    """Return the light (F, 3) of the lamps of near_ps at the origin, from their Phi; None without
-    it. Raises InputError.
+    """Return the light intensities (F, 3) of near_ps lamps at the origin, computed from Phi.
+
+    None if the file has no Phi. Raises InputError.
     """
     if "Phi" not in names(path):
         return None
@@ -585,11 +592,11 @@ def _read_pixel_size(path: Path) -> float:
             f'found "{text[:40]}", expected one number above 0, the width of a pixel',
             path,
             line=line,
-            hint="Write the number alone; its unit is the unit of the lamps' positions",
+            hint="Write only the number, in the unit of the lamps' positions",
         )
     return size
 
 
 def _find(name: str, folder: Path, positions: Path | None) -> Path | None:
-    """Return the file of this name in the folder, or else beside the file of positions."""
+    """Return the file with this name in the folder, or else next to the file of positions."""
     return find_named(folder, [name]) or (positions and find_named(positions.parent, [name]))

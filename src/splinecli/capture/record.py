@@ -1,4 +1,4 @@
-"""The capture record that all steps after the recipe use, and lights estimated from the images."""
+"""The capture record used by all steps after the recipe, and lights estimated from the images."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _SIDES = (
 )
 # azimuths, counter-clockwise from the right
 SIDES_DEG = {side: 45.0 * place for place, side in enumerate(_SIDES)}
-ESTIMATE = "estimate"  # given instead of a light file: the lights are estimated from the images
+ESTIMATE = "estimate"  # used instead of a light file: the lights are estimated from the images
 
 
 @dataclass(frozen=True, eq=False)
 class FoundLights:
-    """Lights of F images."""
+    """Estimated lights of F images."""
 
     directions: Float64Array  # (F, 3) float64, unit; x right, y up, z to the camera
     errors_deg: Float64Array  # (F,), the expected errors of the directions in degrees
@@ -41,7 +41,8 @@ class FoundLights:
 
 
 def azimuth_of(first_light: str) -> float:
-    """Return the azimuth in degrees of a side of the image, such as `upper-left`, or of a number.
+    """Return the azimuth in degrees for a number or a side of the image, such as `upper-left`.
+
     Raises UsageError.
     """
     try:
@@ -50,16 +51,14 @@ def azimuth_of(first_light: str) -> float:
         azimuth = np.nan
     if not abs(azimuth) <= 360:
         raise UsageError(
-            f"the first light comes from {first_light!r}; expected one of {', '.join(SIDES_DEG)},"
-            " or its azimuth in degrees, counter-clockwise from the right"
+            f"found {first_light!r} as the side of the first light, expected one of"
+            f" {', '.join(SIDES_DEG)}, or its azimuth in degrees, counter-clockwise from the right"
         )
     return azimuth
 
 
 def placeholders(n_lights: int) -> Float64Array:
-    """Return arbitrary directions (F, 3) that give normals, as placeholders until the lights are
-    estimated.
-    """
+    """Return arbitrary valid directions (F, 3), to be used until the lights are estimated."""
     azimuth = 2 * np.pi * np.arange(n_lights) / max(n_lights, 1)
     return np.stack((0.6 * np.cos(azimuth), 0.6 * np.sin(azimuth), np.full(n_lights, 0.8)), axis=1)
 
@@ -74,36 +73,38 @@ _DTYPES: dict[type[np.generic], tuple[str, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """One object under F lights, photographed by a fixed camera. It is validated on construction.
+    """One object under F lights, photographed by a fixed camera. The record is validated on
+    construction.
 
     Frame: x right, y up, z to the camera; light directions are unit vectors towards the light.
 
     Args:
-        observations: (P, F) float32, linear: every channel divided by its light's intensity, then
-            the mean of the channels. Only the mask's pixels, in the mask's row-major order.
+        observations: (P, F) float32, linear, for the mask's pixels in row-major order: the mean
+            over the channels after each was divided by its light intensity.
         light_directions: (F, 3) float64, unit, above the horizon (z > 0).
         light_indices: (F,) zero-based indices of these lights in the whole capture.
         mask: (H, W) bool with P true pixels.
-        ground_truth: (H, W, 3) float32 normals, unit, or zero where the ground truth is unknown; or
+        ground_truth: (H, W, 3) float32 unit normals, zero where the ground truth is unknown; or
             None.
-        warnings: faults that reduce accuracy, and decisions that were made for the user.
-        estimated_intensities: (F,) float64, by which the observations were divided because no file
-            gives the light intensities and the images show that they differ; else None.
-        estimated_colours: (F, 3) float64, the colours of the lamps, by which the channels were
-            divided because they differ from image to image; else None.
+        warnings: faults that reduce accuracy, and choices made on behalf of the user.
+        estimated_intensities: (F,) float64 estimated light intensities, by which the observations
+            were divided because no file contains them and the images show that they differ; else
+            None.
+        estimated_colours: (F, 3) float64 estimated colours of the lamps, by which the channels were
+            divided because they differ between images; else None.
         restored: (P, F) bool, true where a saturated observation was replaced by an estimate; None
             if no observation was restored.
-        white_level: the stored value from which observations were considered saturated; None for
+        white_level: the stored value from which observations are considered saturated; None for
             floating-point images and for captures that are not read from images.
         light_errors_deg: (F,) float64, the expected errors of light_directions if they were
             estimated from the images; else None.
         removed_blur: the standard deviation in pixels of the blur that was removed from the images;
-            None if there is none.
-        lamps: the positions of near lamps; light_directions then hold at the origin, the middle of
-            the image on the object's mean plane. None for distant lights.
+            None if no blur was removed.
+        lamps: the positions of near lamps. In this case, light_directions are valid at the origin,
+            the centre of the image on the object's mean plane. None for distant lights.
         camera_matrix: (3, 3) float64, in pixels of the mask, as in OpenCV. None assumes an
-            orthographic camera. Near lamps have their own.
-        mended: the codes of the faults that were clear and were mended.
+            orthographic camera. Near lamps have their own camera matrix.
+        mended: the codes of unambiguous faults that were corrected.
 
     Raises:
         InputError: the shapes disagree, a value is not finite, a light is not a unit vector above
@@ -130,8 +131,7 @@ class Capture:
     mended: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        # The record is frozen, so its fields get their dtypes here; those that have them are not
-        # copied.
+        # The record is frozen, so dtypes are converted here. Arrays are only copied if necessary.
         for dtype, names in _DTYPES.items():
             for name in names:
                 values = getattr(self, name)
@@ -181,8 +181,8 @@ class Capture:
         )
 
     def choose_pixels(self, positions: Integers) -> Capture:
-        """Return the same capture with some of its pixels, from their rising zero-based positions
-        in this record.
+        """Return the capture with a selection of its pixels, from ascending zero-based positions
+        (p,).
         """
         mask = np.zeros_like(self.mask)
         # Rows of observations follow the mask's row-major order, and so do the mask's flat indices.
@@ -206,9 +206,7 @@ class Capture:
                 f"{self.name}: {len(self.light_indices)} light indices for {len(lights)} lights"
             )
         if len(lights) < MIN_LIGHTS:
-            hint = (
-                "A normal has three unknowns, so three images under different lights are the fewest"
-            )
+            hint = "A normal has three unknowns, so at least three different lights are needed"
             found = "1 light" if len(lights) == 1 else f"{len(lights)} lights"
             raise InputError(f"{self.name}: {found}, expected at least {MIN_LIGHTS}", hint=hint)
         self._check_shape("light intensities", self.estimated_intensities, (len(lights),))
@@ -223,12 +221,10 @@ class Capture:
             raise InputError(problem, hint="z points to the camera")
         if in_one_plane(lights):
             problem = (
-                f"{self.name}: the {len(lights)} lights are in one plane, so least squares (LS)"
-                " cannot solve"
+                f"{self.name}: the {len(lights)} lights are in one plane, so the normals cannot be"
+                " determined"
             )
-            raise InputError(
-                f"{problem} for a normal", hint="Choose lights that surround the viewing direction"
-            )
+            raise InputError(problem, hint="Choose lights that surround the viewing direction")
 
     def _check_pixels(self) -> None:
         if self.mask.ndim != 2:
@@ -247,38 +243,37 @@ class Capture:
         self._check_shape("ground truth", self.ground_truth, (*self.mask.shape, 3), "(H, W, 3) = ")
         for block in [] if self.ground_truth is None else _blocks(self.ground_truth.reshape(-1, 3)):
             length = np.linalg.norm(block, axis=1)
-            # In this form, NaN fails the check, too.
+            # NaN also fails this form of the check.
             if not ((length == 0) | (np.abs(length - 1) <= _UNIT_TOLERANCE)).all():
                 raise InputError(
                     f"{self.name}: a ground-truth normal is neither a unit vector nor zero"
                 )
 
     def _check_shape(
-        self, what: str, array: Array | None, shape: tuple[int, ...], meaning: str = ""
+        self, name: str, array: Array | None, shape: tuple[int, ...], meaning: str = ""
     ) -> None:
         if array is not None and array.shape != shape:
             raise InputError(
-                f"{self.name}: {what} of shape {array.shape}, expected {meaning}{shape}"
+                f"{self.name}: {name} of shape {array.shape}, expected {meaning}{shape}"
             )
 
 
 def in_one_plane(light_directions: Float64Array) -> bool:
-    """Return whether lights (F, 3) are coplanar, so that Capture rejects them."""
+    """Return whether lights (F, 3) are coplanar, which Capture rejects."""
     singular_values = np.linalg.svd(light_directions, compute_uv=False)
     return bool(singular_values[-1] < 1e-3 * singular_values[0])
 
 
 def check_light_indices(indices: Sequence[int], n_lights: int) -> tuple[int, ...]:
-    """Return the indices as a tuple of ints, in their order.
+    """Return the indices as a tuple of ints, in the same order.
 
-    Raises UsageError if an index is repeated or not below n_lights, or if there are fewer than
-    three.
+    Raises UsageError if an index is repeated or out of range, or if there are fewer than three.
     """
     chosen = tuple(operator.index(index) for index in indices)
     for position, index in enumerate(chosen):
         if not 0 <= index < n_lights:
             problem = f"light index {index} is out of range: the capture has {n_lights} lights"
-            raise UsageError(problem, hint=f"Light indices count from 0 to {n_lights - 1}")
+            raise UsageError(problem, hint=f"Use light indices from 0 to {n_lights - 1}")
         if index in chosen[:position]:
             raise UsageError(f"light index {index} is listed twice", hint="List each light once")
     if len(chosen) < MIN_LIGHTS:
@@ -287,11 +282,11 @@ def check_light_indices(indices: Sequence[int], n_lights: int) -> tuple[int, ...
 
 
 def _blocks(rows: Float32Array, size: int = 1 << 20) -> Iterator[Float32Array]:
-    """Yield some rows at a time, so that a check needs no second copy of a large capture."""
+    """Yield the rows in blocks, so that a check does not need a second copy of a large capture."""
     for start in range(0, len(rows), size):
         yield rows[start : start + size]
 
 
 def name_reading(*, as_stored: bool) -> str:
-    """Return how a capture was prepared, in the words of reports and pixel sets."""
+    """Return the word for how a capture was read in reports and pixel sets."""
     return "as stored" if as_stored else "restored"

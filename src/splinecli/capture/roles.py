@@ -1,4 +1,4 @@
-"""Pictures beside the photographs: masks, ambient images, references without contact, copies."""
+"""Pictures next to the photographs: masks, ambient images and copies."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -24,7 +24,7 @@ from splinecli.system.files import is_folder, is_found_file
 
 
 def copies(images: Sequence[Path]) -> list[CaptureWarning]:
-    """Report which images were left out because another file of the same stem shows the same
+    """Return a warning that lists images left out because another file shows the same
     photograph.
     """
     stored = {page_of(image)[0] for image in images}
@@ -43,15 +43,15 @@ def copies(images: Sequence[Path]) -> list[CaptureWarning]:
         ", ".join(sorted({path.suffix.lower() for path in paths})) for paths in (others, stored)
     )
     text = (
-        f"{len(others)} files ({kinds}) have the names of other images ({used}): they show the"
-        " same photographs, and"
+        f"{len(others)} files ({kinds}) were left out, because images with the same names ({used})"
+        " show the same photographs."
     )
-    return [CaptureWarning(IMAGES_LEFT_OUT, f"{text} were left out.")]
+    return [CaptureWarning(IMAGES_LEFT_OUT, text)]
 
 
 def pictures_of(role: str, folders: Sequence[Path], images: Sequence[Path]) -> list[Path]:
-    """Return the pictures in some folders whose names have the word of a role, and which are not
-    among the images.
+    """Return pictures in these folders whose names contain a role's word and which are not
+    images.
     """
     entries = [path for folder in dict.fromkeys(folders) for path in list_folder(folder)]
     return [p for p in entries if has_role(p, role) and p not in images and is_found_file(p)]
@@ -60,13 +60,12 @@ def pictures_of(role: str, folders: Sequence[Path], images: Sequence[Path]) -> l
 def choose_mask(
     folder: Path, images: Sequence[Path]
 ) -> tuple[Path | None, tuple[CaptureWarning, ...]]:
-    """Return a mask for photographs without one of a usual name, and a warning that names it; None
-    if none is found.
+    """Return a mask for photographs without a usual mask file, and a warning that names it.
 
-    It is the only picture of their size with the word "mask" in its name, in the folder, in a
-    folder of masks, or beside the folder with its name; or the mask in the .mat file of the
-    photographs; or else the alpha channel of the first photograph. If several pictures match, none
-    is chosen.
+    Candidates are pictures of the photographs' size with the word "mask" in their names in the
+    folder, pictures in a folder of masks, and pictures next to the folder that have its name.
+    Without candidates, use the mask in the .mat file of the photographs, or the alpha channel of
+    the first photograph. None if there is no candidate or more than one.
     """
     named = _masks_by_name(folder, images)
     try:
@@ -74,7 +73,7 @@ def choose_mask(
         masks = [path for path in named if read_header(path).size[0][:2] == size[:2]]
         if not named and read_header(images[0]).stated_channels in (2, 4):
             masks = [images[0]] if cut_out(decode_with_alpha(images[0])[1]) is not None else []
-    except InputError:  # reading the images reports the damage
+    except InputError:  # reported when the images are read
         return None, ()
     stored, _ = page_of(images[0])
     if not masks and stored.suffix.lower() == ".mat":
@@ -83,16 +82,12 @@ def choose_mask(
         return stored.with_name(f"{stored.name}[mask]") if has_mask else None, ()
     if not masks:
         return None, ()
-    text = f"{masks[0].name} is used as the mask, by its name. Give --mask FILE for another one."
-    if masks[0] in images:
-        text = (
-            f"The alpha channel of {masks[0].name} is used as the mask. Give --mask FILE for"
-            " another one."
-        )
+    source = f"The alpha channel of {masks[0].name}" if masks[0] in images else masks[0].name
+    text = f"{source} is used as the mask. To use another one, pass --mask FILE."
     if len(masks) > 1:
         text = (
-            f"{', '.join(path.name for path in masks)}: none is used as the mask. Choose one with"
-            " --mask FILE."
+            "No mask is used, because several files may be the mask:"
+            f" {', '.join(path.name for path in masks)}. Choose one with --mask FILE."
         )
     return masks[0] if len(masks) == 1 else None, (CaptureWarning(MASK_CHOICE, text),)
 
@@ -103,7 +98,7 @@ def _masks_by_name(folder: Path, images: Sequence[Path]) -> list[Path]:
         if inside.name.lower() in ("mask", "masks") and is_folder(inside):
             named += [p for p in list_folder(inside) if p.suffix.lower() in PICTURE_SUFFIXES]
     name = folder_name(folder).lower()
-    with suppress(InputError):  # we may lack permission to read the parent folder
+    with suppress(InputError):  # the parent folder may be unreadable
         for path in pictures_of("mask", [folder.absolute().parent], images):
             if ROLES["mask"].sub("", path.stem.lower()).strip("._- ") == name:
                 named.append(path)
@@ -111,8 +106,10 @@ def _masks_by_name(folder: Path, images: Sequence[Path]) -> list[Path]:
 
 
 def find_ambient(folder: Path, images: Sequence[Path]) -> Path | None:
-    """Return the image under none of the lights: the first with the usual name, or else the only
-    picture of the photographs' size with the word "ambient" in its name; None if there is none.
+    """Return the image without any of the lights; None if there is none.
+
+    It has a usual name, or is the only picture of the photographs' size with the word "ambient" in
+    its name.
     """
     folders = folder, images[0].parent
     usual = find_named(folder, AMBIENT) or find_named(folders[1], AMBIENT)

@@ -1,4 +1,4 @@
-"""A sample of the pixels of a capture, small enough for checks that use neighbours."""
+"""Samples of a capture's pixels, small enough for checks that depend on neighbouring pixels."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -21,23 +21,19 @@ class Sample:
     # (p, F), linear, divided by the light intensities; pixels of the mask in row-major order
     observations: Floats
     mask: Bools  # (h, w) bool with p true pixels
-    step: int  # rows and columns of the images from one pixel of the grid to the next
+    step: int  # distance between neighbouring pixels of the grid, in pixels of the images
 
 
 def grid_of(mask: Bools) -> Part:
-    """Return the rows and columns of a grid that contains about MAX_PIXELS pixels of the mask (H,
-    W), or fewer.
-    """
+    """Return rows and columns of a grid with at most about MAX_PIXELS pixels of the mask (H, W)."""
     step = max(1, int(np.ceil(np.sqrt(np.count_nonzero(mask) / MAX_PIXELS))))
     return slice(None, None, step), slice(None, None, step)
 
 
 def closeup_of(mask: Bools) -> Part:
-    """Return the rows and columns of a square of CLOSEUP_SIDE around the middle of a mask (H, W)
-    with pixels.
-    """
+    """Return rows and columns of a square of side CLOSEUP_SIDE at the middle of a mask (H, W)."""
     middles = []
-    # The median row and column of its pixels, without listing them, which takes 16 bytes each.
+    # Find the median row and column without listing the pixels, which takes 16 bytes for each.
     for axis in (1, 0):
         up_to = np.cumsum(np.count_nonzero(mask, axis=axis))
         middles.append(int(np.searchsorted(up_to, (up_to[-1] + 1) // 2)))
@@ -46,7 +42,7 @@ def closeup_of(mask: Bools) -> Part:
 
 
 def pixels_of(parts: Iterable[Part], mask: Bools) -> Bools:
-    """Return the pixels of a mask (H, W) that are in one of the parts."""
+    """Return the pixels of a mask (H, W) that are inside one of the parts."""
     chosen = np.zeros_like(mask)
     for part in parts:
         chosen[part] = mask[part]
@@ -56,10 +52,10 @@ def pixels_of(parts: Iterable[Part], mask: Bools) -> Bools:
 def sample_observations(
     observations: Floats, mask: Bools, part: Part | None = None, known: Bools | None = None
 ) -> Sample:
-    """Return the sample of a mask (H, W) in a part of the images; None for its grid.
+    """Return a sample from a part of the images, or from the mask's grid by default.
 
-    Observations (P, F) cover the mask, or only its `known` pixels, which include at least the
-    pixels of the part.
+    The observations (P, F) cover the mask (H, W), or only its `known` pixels, which must include
+    the part.
     """
     part = part or grid_of(mask)
     chosen = pixels_of([part], mask)
@@ -69,10 +65,9 @@ def sample_observations(
 
 
 def leave_out_background(sample: Sample) -> tuple[Sample, float]:
-    """Return a sample of a capture without a mask, without its dark background, and the share of
-    that background.
+    """Return the sample without a dark background, and the share of its pixels left out.
 
-    A sample that has a mask, or no dark background, is returned as it is.
+    The sample is unchanged if it has a mask or no dark background.
     """
     if not sample.mask.all() or min(sample.mask.shape) < 8:
         return sample, 0.0

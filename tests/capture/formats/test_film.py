@@ -101,9 +101,9 @@ def test_code_points_go_before_other_curves(tmp_path, number, curve):
 
 def test_what_is_no_film_or_truncated_is_refused(tmp_path):
     for content, problem in (
-        (b"", "found no video"),
-        (b"#EXTM3U\n#EXTINF:1,\nother.ts\n", "found no video"),
-        (b"ffconcat version 1.0\nfile other.mp4\n", "found no video"),
+        (b"", "is not a video"),
+        (b"#EXTM3U\n#EXTINF:1,\nother.ts\n", "is not a video"),
+        (b"ffconcat version 1.0\nfile other.mp4\n", "is not a video"),
         (b"\0\0\0\x18ftypisom" + bytes(200), "the video is damaged"),
     ):
         path = tmp_path / "clip.mp4"
@@ -113,7 +113,7 @@ def test_what_is_no_film_or_truncated_is_refused(tmp_path):
             choose_frames(path)
     for name, codec, message in (
         ("clip.mp4", "mp4v", "damaged"),  # the index at the end is missing
-        ("clip.avi", "MJPG", r"breaks off: \d+ of 40 frames|damaged"),
+        ("clip.avi", "MJPG", r"incomplete: only \d+ of 40 frames|damaged"),
     ):
         film = write_film(tmp_path / name, sphere_film(path_of_lamp(40)), codec)
         film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])

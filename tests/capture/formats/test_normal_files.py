@@ -95,7 +95,7 @@ def test_mat_with_another_key(tmp_path, normals):
     for arrays, names in (({"N": normals, "M": normals}, "N, M"), ({"mask": MASK}, "none")):
         scipy.io.savemat(path, arrays)
         with pytest.raises(
-            InputError, match=f"no Normal_gt, and of other H x W x 3 arrays {names}, expected one"
+            InputError, match=f"no array Normal_gt, and of other arrays H x W x 3 {names}, expected"
         ):
             read_normals(path, MASK)
 
@@ -153,7 +153,7 @@ def test_a_photograph_is_no_normal_map_and_a_huge_value_overflows_nothing(
     for bits in (8, 16):
         picture = np.random.default_rng(0).integers(0, 2**bits, (40, 50, 3)).astype(f"uint{bits}")
         with pytest.raises(
-            InputError, match=r"found 3\d % of the pixels to be unit vectors.*these are not normals"
+            InputError, match=r"only 3\d % of the pixels are unit vectors.*this is not a normal map"
         ):
             read_normal_map(write_image("photograph.png", picture))
     damaged = normals.astype(np.float32)

@@ -1,7 +1,7 @@
-"""Videos as captures: a fixed camera records an object while a lamp is carried around it.
+"""Videos as captures: a fixed camera records an object while someone moves a lamp around it.
 
-Only a few of the hundreds of frames are needed: sharp ones, not overexposed, with lights as
-different as possible.
+A few of the hundreds of frames are enough: sharp ones that are not overexposed and have very
+different lights.
 """
 
 from __future__ import annotations
@@ -29,29 +29,27 @@ if TYPE_CHECKING:
 
 MOST_FRAMES, FEWEST_FRAMES = 24, 6
 _CANDIDATES = 1000  # most frames that are compared; longer videos are subsampled by 2, 4 and so on
-# FFmpeg recognises playlists by their content, and these name other files. So only containers of
-# videos are opened.
+# FFmpeg would also open playlists, which refer to other files, so only video containers are opened.
 _CONTAINERS = re.compile(rb"....(ftyp|moov|mdat|wide)|RIFF|\x1a\x45\xdf\xa3", re.DOTALL)
-# A frame that may be chosen: its number, its linear thumbnail, its sharpness and its share of
-# clipped pixels.
+# The number of a frame, its linear thumbnail, its sharpness and its share of clipped pixels
 _Candidate = tuple[int, Float32Array, float, float]
 
 
 def is_film(path: Path) -> bool:
-    """Return whether the path has the name of a video, and is not a folder."""
+    """Return whether the path has the suffix of a video and is not a folder."""
     suffixes = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
     return path.suffix.lower() in suffixes and path.stem.strip(".") != "" and not is_folder(path)
 
 
 def choose_frames(film: Path) -> tuple[int, ...]:
-    """Return the ascending numbers, from 0, of FEWEST_FRAMES to MOST_FRAMES frames whose lights
-    differ most.
+    """Return the ascending zero-based numbers of the frames whose lights differ most.
 
-    Raises InputError if the video cannot be read, or its light does not move.
+    Between FEWEST_FRAMES and MOST_FRAMES frames are chosen. Raises InputError if the video cannot
+    be read, or if its light does not move.
     """
     numbers, thumbnails, sharpness, clipped = map(np.array, zip(*_candidates(film), strict=True))
     light = thumbnails.mean(axis=1)
-    # Sharpness depends on the light, so only neighbouring frames are compared.
+    # Sharpness also depends on the light, so only neighbouring frames are compared.
     around = [
         np.median(sharpness[max(0, place - 7) : place + 8]) for place in range(len(sharpness))
     ]
@@ -64,23 +62,24 @@ def choose_frames(film: Path) -> tuple[int, ...]:
     chosen = _farthest(thumbnails[usable])
     if len(chosen) < FEWEST_FRAMES:
         raise InputError(
-            f"found {len(chosen)} of {len(numbers)} frames that are sharp and differ in their"
-            f" light, expected at least {FEWEST_FRAMES}",
+            f"found {len(chosen)} of {len(numbers)} frames that are sharp and under different"
+            f" lights, expected at least {FEWEST_FRAMES}",
             film,
-            hint="Record from a tripod while the lamp moves all around the object,"
-            " with focus and exposure locked",
+            hint="Record from a tripod while you move the lamp all around the object, with focus"
+            " and exposure locked",
         )
     return tuple(sorted(numbers[usable][chosen].tolist()))
 
 
 def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
-    """Yield the frames with these ascending numbers as stored: (H, W, 3) RGB, usually with the
-    curve BT709. Raises InputError.
+    """Yield frames by ascending number as stored: (H, W, 3) RGB, usually encoded with BT709.
+
+    Raises InputError.
     """
     with _opened(film) as video:
         place = 0
         for number in numbers:
-            with native_stderr():  # kept short, because it also blocks progress bars
+            with native_stderr():  # brief, because it also blocks progress bars
                 while place <= number and video.grab():
                     place += 1
                 if place <= number:
@@ -90,8 +89,9 @@ def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8
 
 
 def _candidates(film: Path) -> list[_Candidate]:
-    """Return evenly spaced frames, with the measurements for choosing among them. Raises
-    InputError.
+    """Return evenly spaced frames with the measurements needed for choosing among them.
+
+    Raises InputError.
     """
     import cv2
 
@@ -110,7 +110,7 @@ def _candidates(film: Path) -> list[_Candidate]:
             raise ValueError
     if number < 0.8 * stated:
         raise InputError(
-            f"the video breaks off: {number} of {stated:.0f} frames can be read",
+            f"the video is incomplete: only {number} of {stated:.0f} frames can be read",
             film,
             hint="Copy it again",
         )
@@ -139,10 +139,10 @@ def _candidate(number: int, picture: NDArray[np.uint8]) -> _Candidate:
 
 
 def _farthest(thumbnails: Float32Array) -> list[int]:
-    """Choose thumbnails (N, P) one by one, each the farthest from those chosen. Brightness is
-    ignored.
+    """Return the positions of thumbnails (N, P) that differ most, ignoring their brightness.
 
-    Unit vectors closer than 0.05 are considered to have the same light.
+    Each is the farthest from those chosen before. Unit vectors less than 0.05 apart are considered
+    to have the same light.
     """
     if not len(thumbnails):
         return []
@@ -162,17 +162,17 @@ def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
     import cv2
 
     check_file(film, "a video")
-    problem = "the video is damaged, or in a form that cannot be read"
+    problem = "the video is damaged or its format is not supported"
     hint = "Copy it again, or convert it to MP4 with H.264"
     with damage_as_input_error(film, problem, hint), film.open("rb") as file:
         if not _CONTAINERS.match(file.read(16)):
             raise InputError(
-                "found no video",
+                "the file is not a video",
                 film,
-                hint="MP4, MOV, AVI, MKV and WebM files are read as videos",
+                hint="MP4, MOV, AVI, MKV and WebM files are supported",
             )
         file.seek(0)
-        # FFmpeg's threads print between the calls, too. OpenCV reads this before it opens its first
+        # FFmpeg's threads also print between calls. OpenCV reads this before opening its first
         # video.
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
         with native_stderr():
@@ -192,7 +192,7 @@ def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
 
 
 def _picture(video: cv2.VideoCapture) -> NDArray[np.uint8]:
-    """Return the frame that was grabbed, (H, W, 3) in BGR order. Raises ValueError."""
+    """Return the frame that was grabbed last, (H, W, 3) in BGR order. Raises ValueError."""
     done, picture = video.retrieve()
     if not done or picture is None or picture.ndim != 3:
         raise ValueError

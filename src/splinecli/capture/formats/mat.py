@@ -1,8 +1,8 @@
 """Arrays of real numbers in MATLAB's .mat files of version 5, 6 and 7 (MathWorks, "MAT-File
-Format"), and the photographs among them.
+Format"), and photographs stored in them.
 
-We have our own reader, only for arrays of real numbers, because SciPy's ends the process at unknown
-types.
+This reader supports only arrays of real numbers. It exists because SciPy's reader ends the process
+at unknown types.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ _NUMBERS = {
     13: "u8",
 }
 _CLASSES = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), start=6))
-"""Classes of numeric arrays. MATLAB stores numbers in the smallest type that can represent them: a
-double may be stored as bytes."""
+"""Classes of numeric arrays. MATLAB stores numbers in the smallest type that can represent them, so
+doubles may be stored as bytes."""
 
 
 class Variable(NamedTuple):
-    """A numeric variable of a file: its name, shape and type, and the place, length and byte order
-    of its element.
+    """A numeric variable: its name, shape and type, and the position, length and byte order of its
+    data.
     """
 
     name: str
@@ -67,10 +67,10 @@ def names(path: Path) -> set[str]:
 
 
 def read_matrix(path: Path, choose: Callable[[dict[str, tuple[int, ...]]], str]) -> Array:
-    """Return the numeric matrix of a small file whose name is chosen from the shapes by name.
+    """Return a numeric matrix from a small file, whose name is chosen from the shapes by name.
 
-    Vectors with numbered names, such as l1 and l2, are also a matrix, with one in each row. Only
-    the chosen matrix is expanded. Raises InputError, including those of `choose`.
+    Vectors with numbered names, such as l1 and l2, also form a matrix, with one vector in each row.
+    Only the chosen matrix is decompressed. Raises InputError, including the errors of `choose`.
     """
     with damage_as_input_error(path, *_DAMAGED), path.open("rb") as file:
         found = {
@@ -90,8 +90,9 @@ def read_matrix(path: Path, choose: Callable[[dict[str, tuple[int, ...]]], str])
 
 
 def _numbered(found: Iterable[Variable]) -> dict[tuple[str, tuple[int, ...]], list[Variable]]:
-    """Return at least three variables of equal shapes and numbered names, in order, by the stem of
-    their names and their shape.
+    """Return groups of at least three variables with equal shapes and numbered names, in order.
+
+    The keys are the stem of the names and the shape.
     """
     groups = defaultdict(list)
     for variable in found:
@@ -105,7 +106,7 @@ def _numbered(found: Iterable[Variable]) -> dict[tuple[str, tuple[int, ...]], li
 
 
 def numbers_of(file: BinaryIO, variable: Variable) -> Array:
-    """Return the numbers of a variable, with the type that they have in MATLAB.
+    """Return the numbers of a variable in their MATLAB type.
 
     Raises KeyError, ValueError, struct.error or zlib.error for a damaged file.
     """
@@ -117,7 +118,7 @@ def numbers_of(file: BinaryIO, variable: Variable) -> Array:
 
 
 def variables(file: BinaryIO, path: Path) -> Iterator[Variable]:
-    """Yield the arrays of real numbers of an open file, without reading their numbers.
+    """Yield the arrays of real numbers in an open file, without reading their numbers.
 
     Raises InputError for MATLAB 7.3, which is another format, and the errors of numbers_of.
     """
@@ -135,10 +136,10 @@ def variables(file: BinaryIO, path: Path) -> Iterator[Variable]:
         kind, length = struct.unpack(order + "II", tag)
         start, compressed = file.tell(), kind == _COMPRESSED
         if kind in (_COMPRESSED, _MATRIX):
-            # 4096 bytes are enough for its sizes and its name.
+            # 4096 bytes are enough for the sizes and the name.
             parts = _parts(_read(file, start, length, 1 << 12, compressed=compressed), order)
             (flags, *_) = struct.unpack(order + "II", next(parts)[1])
-            if flags & 0xFF in _CLASSES and not flags & (1 << 11):  # of complex numbers
+            if flags & 0xFF in _CLASSES and not flags & (1 << 11):  # the flag of complex numbers
                 shape, name = next(parts)[1], next(parts)[1]
                 sizes = struct.unpack(f"{order}{len(shape) // 4}I", shape)
                 dtype = _CLASSES[flags & 0xFF]
@@ -150,7 +151,7 @@ def variables(file: BinaryIO, path: Path) -> Iterator[Variable]:
 
 
 def _read(file: BinaryIO, start: int, length: int, most: int, *, compressed: bool) -> memoryview:
-    """Return the content of a matrix, up to a number of bytes."""
+    """Return the content of a matrix, limited to a number of bytes."""
     file.seek(start)
     content = file.read(min(length, most))
     if compressed:
@@ -159,8 +160,9 @@ def _read(file: BinaryIO, start: int, length: int, most: int, *, compressed: boo
 
 
 def _parts(content: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
-    """Yield the type and bytes of each part of a matrix: flags, sizes, name, numbers. Parts are
-    padded to 8 bytes.
+    """Yield the type and bytes of each part of a matrix: flags, sizes, name and numbers.
+
+    Parts are padded to 8 bytes.
     """
     place = 0
     while place + _TAG_BYTES <= len(content):
@@ -175,19 +177,19 @@ def _parts(content: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
 
 _PICTURES = ("i", "im", "ims", "img", "imgs", "image", "images", "photos", "stack", "data")
 _MASKS = ("mask", "m", "msk")
-_MOST_FILES = 4  # whose tables are kept
-_MOST_PICTURES = 9_999  # whose numbers page_of reads
+_MOST_FILES = 4  # number of files whose contents are cached
+_MOST_PICTURES = 9_999  # the largest number that page_of reads
 
 
 @dataclass(frozen=True)
 class Stack:
     """The photographs in a .mat file, and their mask.
 
-    The axes of each array are letters: F images, H rows, W columns, C channels.
+    The axes of each array are letters: F images, H rows, W columns and C channels.
     """
 
-    arrays: tuple[Variable, ...]  # one of all photographs, or one for each
-    axes: str  # such as "HWF", or "HW" if each photograph is an array of its own
+    arrays: tuple[Variable, ...]  # one array for all photographs, or one for each
+    axes: str  # such as "HWF", or "HW" if each photograph is a separate array
     mask: Variable | None
 
     @property
@@ -205,11 +207,11 @@ class Stack:
 
 
 def find_stack(path: Path) -> Stack | None:
-    """Return the photographs in a .mat file, without reading them; None if it contains none. Raises
-    InputError.
+    """Return the photographs in a .mat file, without reading them; None if there are none.
 
-    They are one array H x W x F or H x W x C x F, or with F first as NumPy's users save them, or
-    arrays with numbered names. If several are possible, one is chosen whose name is usual.
+    They are one array H x W x F or H x W x C x F, an array with F first as NumPy's users save it,
+    or several arrays with numbered names. Among several possible arrays, one with a usual name is
+    chosen. Raises InputError.
     """
     with reading(path):
         stamp = path.stat()
@@ -223,11 +225,11 @@ def _find_stack(path: Path, *_: int) -> Stack | None:
     counts = {n for v in found if len(v.shape) == 2 and 3 in v.shape for n in v.shape}
     masks = [v for v in found if len(v.shape) == 2 and v.name.lower() in _MASKS]
     size = masks[0].shape if len(masks) == 1 else None
-    stacks: list[tuple[bool, Stack]] = []  # each with whether its name is unusual
+    stacks: list[tuple[bool, Stack]] = []  # true for a stack with an unusual name
     for variable in found:
         axes = _axes(variable.shape, counts, size)
         usual = variable.name.lower() in _PICTURES
-        if axes is not None and (usual or variable.shape[2:] != (3,)):  # such as normals
+        if axes is not None and (usual or variable.shape[2:] != (3,)):  # for example normals
             stacks.append((not usual, Stack((variable,), axes, None)))
     for key, group in _numbered(found).items():
         shape = key[1]
@@ -242,11 +244,11 @@ def _find_stack(path: Path, *_: int) -> Stack | None:
 
 
 def _axes(shape: tuple[int, ...], counts: set[int], size: tuple[int, ...] | None) -> str | None:
-    """Return the axes of an array of photographs; None for another array.
+    """Return the axes of an array of photographs; None for any other array.
 
     Args:
         counts: possible numbers of lights.
-        size: of the mask (H, W), or None.
+        size: the mask's (H, W), or None.
     """
     possible = ["HWF", "FHW"] if len(shape) == 3 else []
     if len(shape) == 4:
@@ -259,12 +261,14 @@ def _axes(shape: tuple[int, ...], counts: set[int], size: tuple[int, ...] | None
         is_size = size == (sizes["H"], sizes["W"])
         return is_size, sizes["F"] in counts, sizes["F"] < min(sizes["H"], sizes["W"])
 
-    return max(possible, key=fit)  # the first of equal ones
+    return max(possible, key=fit)  # the first one if several fit equally well
 
 
 def picture_size(path: Path) -> tuple[tuple[int, ...], int]:
-    """Return the shape (H, W, C) of a photograph or mask of a .mat file, such as a.mat[0] or
-    a.mat[mask], and the bytes of each number. Raises InputError.
+    """Return the shape (H, W, C) of a photograph or mask in a .mat file, and the bytes of each
+    number.
+
+    The path ends with its place in the file, as in a.mat[0] or a.mat[mask]. Raises InputError.
     """
     stack, _, (variable, *_) = _place(path)
     is_mask = page_of(path)[1] == MASK_PAGE
@@ -273,14 +277,15 @@ def picture_size(path: Path) -> tuple[tuple[int, ...], int]:
 
 
 def stack_bytes(path: Path) -> int:
-    """Return the memory that reading a photograph takes, in bytes: the whole array is read.
+    """Return the memory in bytes for reading a photograph, which requires the whole array.
+
     Raises InputError.
     """
     return 2 * 8 * math.prod(_place(path)[2][0].shape)
 
 
 def read_picture(path: Path) -> Array:
-    """Return a photograph or mask of a .mat file as stored, (H, W) or (H, W, C). Raises
+    """Return a photograph or mask in a .mat file as stored, (H, W) or (H, W, C). Raises
     InputError.
     """
     stack, number, (variable, *_) = _place(path)
@@ -293,8 +298,8 @@ def read_picture(path: Path) -> Array:
 
 
 def _place(path: Path) -> tuple[Stack, int, tuple[Variable, ...]]:
-    """Return the stack, the number of a picture in it, and the arrays from the one with the
-    picture on.
+    """Return the stack, the number of a picture in it, and the arrays starting with the picture's
+    own.
     """
     stored, number = page_of(path)
     stack = find_stack(stored)
@@ -308,7 +313,7 @@ def _place(path: Path) -> tuple[Stack, int, tuple[Variable, ...]]:
     return stack, number, arrays
 
 
-@lru_cache(1)  # of a compressed array, each photograph would be expanded with all others
+@lru_cache(1)  # a compressed array would otherwise be decompressed for each photograph
 def _read_array(path: Path, variable: Variable, *_: int) -> Array:
     with damage_as_input_error(path, *_DAMAGED), path.open("rb") as file:
         return numbers_of(file, variable)

@@ -3,14 +3,14 @@ from scanners.
 
 Frame: x right, y up, z to the camera. A file is one of
 
-- MATLAB .mat: the array Normal_gt, or else the only H x W x 3 array; and .npy. Unsigned integers
-  are a picture;
-- .txt: H*W rows of x y z in row-major order, for ground truth only;
-- a picture: n = 2 v / full scale - 1, black or mid-gray without a normal; a floating-point TIFF
-  contains n itself.
+- MATLAB .mat, with the array Normal_gt or a single H x W x 3 array, or .npy. Unsigned integers are
+  treated as colours of a picture;
+- .txt, for ground truth only, with H*W rows of x y z in row-major order;
+- a picture with n = 2 v / full scale - 1, black or mid-gray where there is no normal; a
+  floating-point TIFF contains n itself.
 
-Vectors are scaled to unit length. Zero and non-finite vectors are not normals. Depth maps are
-floating-point .npy, TIFF and OpenEXR files.
+Vectors are scaled to unit length; zero and non-finite vectors are treated as missing. Depth maps
+are floating-point .npy, TIFF and OpenEXR files.
 """
 
 import io
@@ -37,15 +37,15 @@ from splinecli.maths.pixel_grid import slices
 from splinecli.system.files import StrPath, check_file, utf8_name
 from splinecli.system.machine import import_extra
 
-_LARGEST = 1e100  # values of damaged files may have an infinite square
-_MOST_CHANNELS = 256  # of an EXR file; renderers write up to about a hundred
-_BLOCK = 1 << 20  # pixels scaled at a time: in float64, a large picture would need much memory
+_LARGEST = 1e100  # the squares of larger values, in damaged files, may be infinite
+_MOST_CHANNELS = 256  # in an EXR file; renderers write up to about a hundred
+_BLOCK = 1 << 20  # pixels scaled at a time, because a large picture in float64 needs much memory
 
 
 class _Stored(NamedTuple):
-    """Vectors as a file stores them."""
+    """Vectors in the form in which a file stores them."""
 
-    values: Array  # (H, W, 3); a picture's values are colours, n = 2 v / full scale - 1
+    values: Array  # (H, W, 3); in a picture, these are colours with n = 2 v / full scale - 1
     alpha: Array | None  # (H, W), the alpha channel of a picture
     is_picture: bool
 
@@ -53,17 +53,17 @@ class _Stored(NamedTuple):
 def read_normal_map(
     path: StrPath, mask: Bools | Path | None = None, *, convention: Convention = "opengl"
 ) -> Float32Array:
-    """Return a normal map (H, W, 3) float32 of any size: unit vectors with y up, or zero without a
+    """Return a normal map (H, W, 3) float32 of any size: unit vectors with y up, zero without a
     normal.
 
-    Raises InputError if the file cannot be read, contains no normal map, or is not of the mask's
-    size.
+    Raises InputError if the file cannot be read, contains no normal map, or does not have the size
+    of the mask.
 
     Args:
-        path: any of the files above but text.
-        mask: (H, W), True at the pixels whose normals are read; or a mask image. If a picture's
-            alpha channel cuts something out, that is left out, too.
-        convention: whether green is y up or y down in a picture.
+        path: any of the files above except text.
+        mask: (H, W), True at the pixels whose normals are read; or a mask image. Transparent pixels
+            of a picture are also left out.
+        convention: whether green points up ("opengl") or down ("directx") in a picture.
     """
     path = Path(path)
     expected = None
@@ -87,13 +87,13 @@ def read_normal_map(
 def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Float32Array, bool]:
     """Return ground truth (H, W, 3) float32, and whether it was flipped vertically.
 
-    Vectors have unit length, or are zero outside the mask and in pixels without ground truth. Text
-    files are flipped vertically if they then fill the mask clearly better, like the normal.txt of
-    DiLiGenT's Harvest. Raises InputError if the file cannot be read, has another size, or has no
-    normal inside the mask.
+    Vectors have unit length, or are zero outside the mask and in pixels without ground truth. A
+    text file is flipped vertically if it then fits the mask clearly better, as with the normal.txt
+    of DiLiGenT's Harvest. Raises InputError if the file cannot be read, has another size, or
+    contains no normal inside the mask.
 
     Args:
-        path: any of the files above; pictures as PNG or TIFF.
+        path: any of the files above; pictures only as PNG, TIFF or BMP.
         mask: (H, W), of the size of the images, True at the pixels whose normals are read.
     """
     path = Path(path)
@@ -118,7 +118,8 @@ def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Float32Array, bool]:
 
 
 def _read_vectors(path: Path, expected: images.ExpectedSize | None) -> _Stored:
-    """Return the vectors of a file of normals. Its size is compared before its values are read.
+    """Return the vectors in a file of normals. Its size is checked before its values are read.
+
     Raises InputError.
     """
     check_file(path, "a normal map")
@@ -130,8 +131,7 @@ def _read_vectors(path: Path, expected: images.ExpectedSize | None) -> _Stored:
         with damage_as_input_error(
             path, "the .npy file is damaged, or contains no array of numbers"
         ):
-            # A map of the file, which reads the header alone. It rejects a file that is shorter
-            # than its header states.
+            # Mapping the file only reads the header. A file that is too short is rejected.
             array = np.lib.format.open_memmap(path, mode="r")
             images.check_vectors(array.shape, path)
             images.check_stored_size(array.shape, array.dtype.itemsize, path, expected)
@@ -147,14 +147,13 @@ def _read_vectors(path: Path, expected: images.ExpectedSize | None) -> _Stored:
 
 
 def read_mat(path: Path, expected: images.ExpectedSize | None) -> Array:
-    """Return the array Normal_gt of a file, or else its only array H x W x 3, with the type that it
-    has in MATLAB.
+    """Return the array Normal_gt of a file, or its only H x W x 3 array, in its MATLAB type.
 
-    Sizes are checked before anything is read or expanded.
+    Sizes are checked before anything is read or decompressed.
 
     Raises:
-        InputError: the array is missing, too large or not of the expected size.
-        KeyError, ValueError, struct.error, zlib.error: the file is damaged.
+        InputError: the array is missing, too large or not of the expected size. KeyError,
+            ValueError, struct.error, zlib.error: the file is damaged.
     """
     with path.open("rb") as file:
         variables = list(mat.variables(file, path))
@@ -163,8 +162,8 @@ def read_mat(path: Path, expected: images.ExpectedSize | None) -> Array:
             maps = {v.name: v for v in variables if len(v.shape) == 3 and v.shape[2] == 3}
             if len(maps) != 1:
                 raise InputError(
-                    "found no Normal_gt, and of other H x W x 3 arrays"
-                    f" {', '.join(maps) or 'none'}, expected one",
+                    "found no array Normal_gt, and of other arrays H x W x 3"
+                    f" {', '.join(maps) or 'none'}, expected exactly one",
                     path,
                 )
             (variable,) = maps.values()
@@ -194,10 +193,10 @@ def _read_text(path: Path, height: int, width: int) -> Float64Array:
 def _to_normals(
     stored: _Stored, mask: Bools, path: Path, *, check_floats: bool = False
 ) -> Float32Array:
-    """Return unit vectors (H, W, 3), zero outside the mask (H, W). Raises InputError for values
-    that are not normals.
+    """Return unit vectors (H, W, 3), zero outside the mask (H, W).
 
-    With check_floats, floating-point values must have about unit length, too, as colours must.
+    Colours must have about unit length as vectors; with check_floats, also floating-point values.
+    Raises InputError for values that are not normals.
     """
     values = stored.values
     if values.dtype.kind not in "fiu":
@@ -221,8 +220,8 @@ def _to_normals(
 
 
 def _check_lengths(stored: Array, mask: Bools, path: Path) -> None:
-    """Raise InputError for colours or vectors (H, W, 3) that are not directions, such as a
-    photograph's colours.
+    """Raise InputError for an array (H, W, 3) that does not contain directions, such as a
+    photograph.
     """
     vectors = stored[mask & stored.any(axis=2)][:: max(1, mask.sum() // _BLOCK)].astype(np.float64)
     if stored.dtype.kind == "u":
@@ -232,23 +231,21 @@ def _check_lengths(stored: Array, mask: Bools, path: Path) -> None:
     usable = length > SHORTEST_IN_PICTURE if stored.dtype.kind == "u" else length > 0
     if not usable.any():
         return
-    # Unit vectors may have gone through 8 bits, resizing or JPEG. In photographs, a third has unit
-    # length by chance.
+    # Rounding to 8 bits, resizing and JPEG change the length of unit vectors. In photographs, a
+    # third of the colours have unit length by chance.
     share = float((np.abs(length[usable] - 1) < 0.1).mean())
     if share < 0.6:
-        problem = (
-            f"found {100 * share:.0f} % of the pixels to be unit vectors (in a picture colour * 2"
-            " - 1), expected"
-        )
         raise InputError(
-            f"{problem} nearly all: these are not normals",
+            f"only {100 * share:.0f} % of the pixels are unit vectors (colour * 2 - 1 in a"
+            " picture), so this is not a normal map",
             path,
-            hint="If the background is not black, give a mask",
+            hint="If the background is not black, pass a mask",
         )
 
 
 def read_depth(path: Path, expected: images.ExpectedSize) -> Float64Array:
-    """Return a depth map (H, W) float64, NaN where it is not finite because the depth is unknown.
+    """Return a depth map (H, W) float64, with NaN where the depth is unknown because it is not
+    finite.
 
     Raises:
         InputError: the file cannot be read, is not a map of floating-point numbers, or has another
@@ -284,13 +281,13 @@ def _exr_size(header: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _read_exr(path: Path, expected: images.ExpectedSize) -> Array:
-    """Return the first channel of an EXR file that may hold a depth."""
+    """Return the most likely depth channel of an EXR file."""
     library = import_extra("OpenEXR", "exr")
     with path.open("rb") as file:
         name = utf8_name(path, file)
         with native_stderr():
             headers = [part.header for part in library.File(name, header_only=True).parts]
-        # All channels of all parts are read.
+        # The library reads all channels of all parts.
         sizes = [(*_exr_size(header), len(header["channels"])) for header in headers]
         (height, width, _), n_values = sizes[0], sum(map(math.prod, sizes))
         n_channels = -(-n_values // (height * width))  # or parts of their size
@@ -301,13 +298,13 @@ def _read_exr(path: Path, expected: images.ExpectedSize) -> Array:
                 path,
                 hint="Save the depth alone",
             )
-        # For damaged pixels, the library only prints a warning, and stdout is reserved for the
-        # product of a command.
+        # For damaged pixels, the library only prints a warning. stdout is reserved for the product
+        # of a command.
         with redirect_stdout(io.StringIO()) as printed, native_stderr():
             channels = library.File(name).channels()
     if printed.getvalue():
         raise InputError("the EXR file is damaged and cannot be read", path)
-    # The names of a depth, then any other.
+    # Try the usual names of depth channels first.
     for channel in ("Z", "Y", "R", "V", "depth.Z", "RGB", "RGBA", *channels):
         if channel in channels:
             return np.asarray(channels[channel].pixels)

@@ -20,12 +20,11 @@ _NUMBER_WITH_COMMA = re.compile(r"(?=\D*\d)[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
 
 _FROM_PIPES: dict[Path, bytes] = {}
 
-# The one-based line of a row in its file, this line without comments, and its words
+# The line number of a row, counted from one, its text without comments, and its words
 WordRow = tuple[int, str, list[str]]
 
 MOST_TEXT = 1_000_000
-"""Bytes of the longest text file that is read, unless the number of images sets the limit: 14,000
-lights.
+"""Size limit of text files in bytes, enough for 14,000 lights, if the number of images is unknown.
 """
 
 # Hint for a line with decimal commas
@@ -33,9 +32,7 @@ DECIMAL_POINT = "A comma separates columns; write decimals with a point"
 
 
 class NumberRow(NamedTuple):
-    """A row of numbers, its one-based line in the file, and this line as written,
-    without comments.
-    """
+    """A row of numbers, its line number counted from one, and its text without comments."""
 
     numbers: tuple[float, ...]
     line: int | None  # None in a file without lines, such as JSON
@@ -44,18 +41,20 @@ class NumberRow(NamedTuple):
 
 @dataclass(frozen=True)
 class NumberRows:
-    """The rows of numbers of a text file, at least one, all finite; their lengths may differ."""
+    """The rows of numbers in a text file. There is at least one; all are finite; their lengths may
+    differ.
+    """
 
     path: Path
     rows: tuple[NumberRow, ...] = field(repr=False)
-    # of each row's image, without folders; None if rows begin with numbers
+    # names of the rows' images, without folders; None if rows begin with numbers
     names: tuple[str, ...] | None = None
-    intensities: Float64Array | None = None  # (R, 3), RGB, of the lights of a file that has them
-    # whether each row is a vector x y z, because the format has nothing else
+    intensities: Float64Array | None = None  # (R, 3) RGB light intensities, if the file has them
+    # whether each row is a vector x y z, because the format has no other rows
     are_vectors: bool = False
 
     def as_array(self) -> Float64Array:
-        """Return the rows as (R, C) float64. Raises InputError at the first row that differs in
+        """Return the rows as (R, C) float64. Raises InputError for the first row of another
         length.
         """
         lengths = [len(row.numbers) for row in self.rows]
@@ -77,13 +76,13 @@ def columns(count: int) -> str:
 
 
 def has_decimal_commas(text: str) -> bool:
-    """Return whether a line looks like numbers with decimal commas, such as "0,5 0,3 0,8"."""
+    """Return whether a line seems to contain decimal commas, as in "0,5 0,3 0,8"."""
     has_both = re.search(r"\d,\d", text) and re.search(r"[\s;]", text)
     return "." not in text and has_both is not None
 
 
 def check_text_length(path: Path, most: int, expected: str = "a text file") -> None:
-    """Raise InputError for a text file of more than `most` bytes, or for something that is not a
+    """Raise InputError for a text file of more than `most` bytes, and for a path that is not a
     file.
     """
     check_file(path, expected)
@@ -96,11 +95,11 @@ def check_text_length(path: Path, most: int, expected: str = "a text file") -> N
 
 
 def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file") -> bytes:
-    """Return the bytes of a text file, or of a pipe instead: the shell's `<(...)`, which can be
-    read only once.
+    """Return the bytes of a text file, or of a pipe such as the shell's `<(...)`.
 
-    Raises InputError if it is missing, not a file, or longer than `most` bytes. Messages name
-    `expected` as the expected content.
+    The content of a pipe is kept, because it can be read only once. Raises InputError if the file
+    is missing, not a file, or longer than `most` bytes. Messages describe the expected content as
+    `expected`.
     """
     check_file(path, expected, pipe=True)
     with reading(path):
@@ -122,10 +121,9 @@ def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file
 def read_lines(
     path: Path, *, else_latin_1: bool = False, expected: str = "a text file", most: int = MOST_TEXT
 ) -> list[str]:
-    """Return the lines of a UTF-8 file, with or without a byte order mark, or of UTF-16 with one.
-    Raises InputError.
+    """Return the lines of a file in UTF-8, or in UTF-16 with a byte order mark. Raises InputError.
 
-    With else_latin_1, a file that is not UTF-8 is read as Latin-1, which older programs on Windows
+    With else_latin_1, a file that is not UTF-8 is read as Latin-1, which older Windows programs
     write. For the other arguments, see read_text.
     """
     content = read_text(path, most=most, expected=expected)
@@ -141,7 +139,7 @@ def read_lines(
             ) from None
         text = content.decode("latin-1")
     lines = re.split(r"\r\n|\r|\n", text)
-    if len(lines) > most // 20:  # bytes of a line, on average: each line takes time and memory
+    if len(lines) > most // 20:  # 20 bytes for each line, because lines take time and memory
         raise InputError(f"found {len(lines)} lines, expected at most {most // 20}", path)
     return lines
 
@@ -149,11 +147,11 @@ def read_lines(
 def read_number_rows(
     path: Path, *, expected: str = "a text file", most: int = MOST_TEXT
 ) -> NumberRows:
-    """Return numbers separated by spaces, tabs, commas or semicolons; "#" comments and blank lines
-    are skipped.
+    """Return numbers separated by spaces, tabs, commas or semicolons, without "#" comments and
+    blank lines.
 
     For the arguments, see read_text. Raises InputError with the line for a word that is not a
-    finite number; also for a file without numbers.
+    finite number, and for a file without numbers.
     """
     return parse_rows(read_rows_of_words(path, 3, expected=expected, most=most), path)
 
@@ -161,10 +159,11 @@ def read_number_rows(
 def read_rows_of_words(
     path: Path, n_numbers: int, *, expected: str, most: int = MOST_TEXT
 ) -> list[WordRow]:
-    """Return the words of each line that has any, with points for decimal commas. Raises
-    InputError.
+    """Return the words of each line that is not empty, with decimal points instead of decimal
+    commas.
 
-    A line ends with n_numbers numbers. See read_text for the other arguments.
+    Each line ends with n_numbers numbers. For the other arguments, see read_text. Raises
+    InputError.
     """
     stored = enumerate(read_lines(path, expected=expected, most=most), start=1)
     content = [(line, text.partition("#")[0].strip()) for line, text in stored]
@@ -177,8 +176,9 @@ def read_rows_of_words(
 
 
 def parse_rows(rows: Sequence[WordRow], path: Path) -> NumberRows:
-    """Return the numbers of rows of words. Raises InputError with the line for other words, and for
-    no rows.
+    """Return the numbers in rows of words.
+
+    Raises InputError with the line for other words, and for an empty list.
     """
     if not rows:
         raise InputError("the file contains no numbers", path)
@@ -190,7 +190,7 @@ def parse_rows(rows: Sequence[WordRow], path: Path) -> NumberRows:
 
 
 def split_words(text: str, *, decimal_commas: bool = False) -> list[str]:
-    """Return the words of a line, with points for decimal commas."""
+    """Return the words of a line, with decimal points instead of decimal commas."""
     separators = _SEPARATORS_BESIDE_COMMAS if decimal_commas else _SEPARATORS
     words = [word for word in separators.split(text) if word]
     if decimal_commas:
@@ -200,9 +200,7 @@ def split_words(text: str, *, decimal_commas: bool = False) -> list[str]:
 
 
 def uses_decimal_commas(texts: Sequence[str], n_numbers: int) -> bool:
-    """Return whether the last numbers of lines have decimal commas and other separators, as in "0,5
-    0,3 0,8".
-    """
+    """Return whether the last numbers of the lines have decimal commas, as in "0,5 0,3 0,8"."""
     tails = [_SEPARATORS_BESIDE_COMMAS.split(text)[-n_numbers:] for text in texts]
     is_match = _NUMBER_WITH_COMMA.fullmatch
     rows = [words for words in tails if len(words) == n_numbers and any(map(is_match, words))]
@@ -211,20 +209,20 @@ def uses_decimal_commas(texts: Sequence[str], n_numbers: int) -> bool:
 
 
 def to_number(word: str) -> float | None:
-    """Return the number that a word represents, finite or not; None for another word."""
+    """Return the number that a word represents, finite or not; None for any other word."""
     try:
-        # float() also takes Python's notation "1_000", but "2024_01" is the name of an image.
+        # float() also accepts "1_000", but "2024_01" is the name of an image.
         return float(word) if "_" not in word else None
     except ValueError:
         return None
 
 
 def parse_number(word: str, path: Path, line: int) -> float:
-    """Return the finite number that a word of a text file represents. Raises InputError with the
-    line.
+    """Return the finite number that a word represents. Raises InputError with the line for other
+    words.
     """
     value = to_number(word)
     if value is None or not np.isfinite(value):
-        what = "a number" if value is None else "a finite number"
-        raise InputError(f'found "{word[:40]}", expected {what}', path, line=line)
+        expected = "a number" if value is None else "a finite number"
+        raise InputError(f'found "{word[:40]}", expected {expected}', path, line=line)
     return value
