@@ -87,7 +87,7 @@ def test_positions_need_the_camera(run):
     result = run(
         f"calibrate one two {circles}",
         says=(
-            "the lamps' distances are unknown: they are treated as distant",
+            "the lamps' distances are unknown, so the lamps are treated as distant",
             "warning: The lamps' distances are unknown, because the camera is",
         ),
     )
@@ -147,7 +147,7 @@ def test_an_outline_that_may_not_be_the_balls(run):
         code=3,
         says=(
             "disc: the circle in the images (centre 140, 130, radius 110 pixels) may not be the",
-            "(centre 120, 140, radius 40 pixels) is clear, too, and contains all highlights.",
+            "(centre 120, 140, radius 40 pixels) is also clear and contains all highlights.",
             "calibration/calibration.png shows it. Give the ball's circle with --circle X,Y,R,",
         ),
     )
@@ -155,7 +155,7 @@ def test_an_outline_that_may_not_be_the_balls(run):
     run("calibrate disc --circle 120,140,40 --overwrite", says="from --circle")
     assert angles_deg(read_light_directions("calibration/light_directions.txt", 4)).max() < 1.5
     write_balls(Path("still"), LIGHTS[[1, 1, 1, 2]])
-    run("calibrate still -o still", code=3, says="the highlight stays in its place in most images")
+    run("calibrate still -o still", code=3, says="the highlight does not move in most images")
 
 
 def test_two_masks_of_a_ball_are_named(run):

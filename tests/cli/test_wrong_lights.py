@@ -241,7 +241,7 @@ def test_evaluate_skips_a_capture_with_near_lamps(run, rough):
     result = run(
         f"evaluate bump near {arguments}",
         code=3,
-        says="--refine-lights refines distant lights, and this capture has near lamps",
+        says="--refine-lights refines distant lights, but this capture has near lamps",
     )
     document = result.json
     assert [scored["capture"] for scored in document["results"]] == ["bump"]

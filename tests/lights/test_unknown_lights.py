@@ -152,7 +152,7 @@ def test_without_outline_the_first_light_decides_between_bump_and_hollow(hollow)
     images = shade(normals, true, noise=0.002).astype(np.float32)
     with pytest.raises(
         InputError,
-        match=r"a bump or a hollow.* give its mask with --mask .* the first image .* left",
+        match=r"a bump or a hollow.* pass its mask with --mask .* the first image .* left",
     ):
         find_lights(images, everywhere, True)
     found = find_lights(images, everywhere, True, first_light="left")

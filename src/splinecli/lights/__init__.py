@@ -1,3 +1,3 @@
-"""Lights that are found or refined, and the light that reaches each pixel: near lamps,
-interreflection.
+"""Estimation, refinement and calibration of lights, and the light that reaches each pixel: near
+lamps and interreflection.
 """

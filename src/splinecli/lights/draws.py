@@ -1,4 +1,4 @@
-"""Random draws of lights, the same for every capture with the same number of lights."""
+"""Random draws of lights, identical for all captures with the same number of lights."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from splinecli.errors import InputError, UsageError
 from splinecli.maths import Float64Array
 from splinecli.maths.robust import MIN_LIGHTS
 
-DRAWS_STREAM = 1  # of the seed; evaluations have two more, so that all are independent
+DRAWS_STREAM = 1  # stream of the seed; evaluations use two others, so that all are independent
 Draw = tuple[int, ...]  # zero-based indices of lights in the whole capture
 
 
@@ -16,19 +16,19 @@ def draw_lights(
 ) -> list[Draw]:
     """Return random draws of lights without replacement, each in ascending order.
 
-    Trial t depends only on the seed, the number of lights, `n_lights` and t, so captures with the
-    same number of lights get the same draws, and additional trials extend the same list. A draw is
-    repeated only if its lights are coplanar, because no method can solve it. All lights together,
-    or `n_lights` of None, form one draw.
+    Trial t depends only on the seed, the number of lights, `n_lights` and t. Therefore, captures
+    with the same number of lights get the same draws, and additional trials extend the same list. A
+    draw is repeated only if its lights are coplanar, because no method can solve it. If `n_lights`
+    is None or the number of all lights, there is a single draw.
 
-    Raises UsageError for settings that are out of range, or InputError if the lights of every draw
-    were coplanar.
+    Raises UsageError for settings that are out of range, and InputError if the lights of every draw
+    are coplanar.
     """
     available = len(light_directions)
     check_draw_settings(n_lights, trials, seed)
     if n_lights is not None and n_lights > available:
         raise UsageError(
-            f"the capture has {available} lights, too few for draws of {n_lights}",
+            f"the capture has only {available} lights, but --n-lights is {n_lights}",
             hint=f"Use --n-lights {available}, or fewer",
         )
     if n_lights is None or n_lights == available:
@@ -49,12 +49,12 @@ def check_draw_settings(n_lights: int | None, trials: int, seed: int) -> None:
 def _draw(light_directions: Float64Array, n_lights: int, trial: int, seed: int) -> Draw:
     generator = np.random.default_rng([DRAWS_STREAM, seed, len(light_directions), n_lights, trial])
     for _ in range(1000):
-        # Use uniform numbers, not Generator.choice, because this stream is more likely to stay the
-        # same in later NumPy versions.
+        # Unlike Generator.choice, uniform numbers are likely to stay the same in later versions of
+        # NumPy.
         chosen = np.sort(np.argsort(generator.random(len(light_directions)))[:n_lights])
         if not in_one_plane(light_directions[chosen]):
             return tuple(chosen.tolist())
     raise InputError(
-        f"all of 1000 draws of {n_lights} lights are in one plane",
+        f"the lights of all 1000 draws of {n_lights} lights are in one plane",
         hint="Choose more lights, or lights that surround the viewing direction",
     )

@@ -1,10 +1,10 @@
-"""The curl of normals, and lights for which the normals of a matte surface have the least curl.
+"""The curl of normals, and lights for which a matte surface has normals with the least curl.
 
-Normals of a surface have no curl (Horn, "Shape from shading", 1970). If lights and normals are
-multiplied with a matrix and its inverse, a matte surface has the same images, but its normals have
-curl, unless the matrix is a generalised bas-relief transformation (Belhumeur, Kriegman and Yuille,
-"The bas-relief ambiguity", IJCV 1999). Equal or known light intensities leave a rotation (Hayakawa,
-JOSA A 1994), and then only the two lights whose x and y have opposite signs are left.
+The normals of a surface have no curl (Horn, "Shape from shading", 1970). If lights and normals are
+multiplied by a matrix and its inverse, a matte surface has the same images, but its normals have
+curl unless the matrix is a generalised bas-relief transformation (Belhumeur, Kriegman and Yuille,
+"The bas-relief ambiguity", IJCV 1999). If the light intensities are equal or known, only a rotation
+remains (Hayakawa, JOSA A 1994), so that two solutions are left, whose x and y have opposite signs.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from splinecli.maths.pixel_grid import Blocks, on_map
 from splinecli.maths.robust import SHADOW_SHARE, fit_scaled_normals
 
 OPPOSITE = np.array((-1.0, -1.0, 1.0))
-"""Under lights multiplied with it, a hollow looks like a bump under the lights."""
+"""Factors of the lights under which a hollow looks like a bump under the original lights."""
 
 
 def normal_derivatives(
     normals: Floats, mask: Bools, *, most: int, smoothing: float = 1.0
 ) -> Float64Array | None:
-    """Return normals and their derivatives to the right and upwards (3, p, 3), at no more than
-    `most` pixels with neighbours; None for fewer than 50.
+    """Return normals and their derivatives to the right and upwards (3, p, 3).
 
-    The normals (H, W, 3) in a mask (H, W) may have any length; `smoothing` is in pixels.
+    There are at most `most` pixels, all with neighbours; None for fewer than 50. The normals (H, W,
+    3) in a mask (H, W) may have any length; `smoothing` is in pixels.
     """
     inside = binary_erosion(mask)
     if np.count_nonzero(inside) < 50 or min(mask.shape) < 2:
@@ -51,11 +51,12 @@ def normal_derivatives(
 def curl_terms(
     vectors: Float64Array, matrices: Floats, *, least_z: float, least_share: float
 ) -> Float64Array:
-    """Return the terms (n, p) whose sums are the curl of normals that are multiplied with matrices
-    (n, 3, 3): the mean |curl| of their slopes over the mean derivative.
+    """Return terms (n, p) whose sums over pixels are the curls of normals multiplied by matrices
+    (n, 3, 3).
 
-    `vectors` (3, p, 3) are from normal_derivatives. Normals with less than `least_z` do not count;
-    where fewer than the least share of them count, the curl is infinite.
+    A curl is the mean |curl| of the slopes divided by their mean derivative. `vectors` (3, p, 3)
+    are from normal_derivatives. Normals with z below `least_z` are ignored; if fewer than
+    `least_share` of the normals remain, the curl is infinite.
     """
     normals, right, up = np.einsum("dpi,kji->dkpj", vectors, matrices, optimize=True)
     length = np.linalg.norm(normals, axis=2).clip(min=1e-12)
@@ -69,29 +70,29 @@ def curl_terms(
 
     p_x, p_y, q_x, q_y = slope(right, 0), slope(up, 0), slope(right, 1), slope(up, 1)
     curl, size = np.abs(p_y - q_x), np.sqrt(p_x**2 + p_y**2 + q_x**2 + q_y**2)
-    # At edges of the object, both are huge.
+    # At the edges of the object, both are huge.
     largest = np.quantile(size, 0.95, axis=1, keepdims=True)
     weights = counts * facing**3
     found = weights * np.minimum(curl, largest)
     found /= np.maximum((weights * np.minimum(size, largest)).sum(axis=1, keepdims=True), 1e-12)
-    # Pixels that turn away from the camera must not make a matrix look good.
+    # Otherwise, a matrix could reduce the curl by turning normals away from the camera.
     return np.where(counts.mean(axis=1, keepdims=True) >= least_share, found, np.inf)
 
 
 class Lights(NamedTuple):
-    """Directions (F, 3), unit, and relative intensities (F,) of lights."""
+    """Unit directions (F, 3) and relative intensities (F,) of lights."""
 
     directions: Float64Array
     intensities: Float64Array
 
 
 class BestLights(NamedTuple):
-    """The lights that a search chose, and the evidence for them."""
+    """The lights chosen by a search, and the evidence for them."""
 
     lights: Lights
-    start: int  # the number of the start that led to them
-    expected: float  # the mean logarithm of the errors in radians that the network expects
-    curl: float  # of the network's normals
+    start: int  # the index of the starting point that led to them
+    expected: float  # the mean logarithm of the errors in radians predicted by the network
+    curl: float  # the curl of the network's normals
 
 
 _GRID_PIXELS = 3000
@@ -99,9 +100,10 @@ _FITS = 60
 _LEAST_Z, _LEAST_SHARE = 0.15, 0.6
 _CURL_FLOOR = 0.02  # differences between smaller curls are noise
 _ROTATIONS, _KEPT = 3000, 80
-# weights of the directions of the guess and of the logarithm of the curl
+# weights of the guessed directions and of the logarithm of the curl
 _GUESS, _CURL = 4.0, 8.0
-_ROUNDS, _TRIED, _REACH = 16, 100, 0.15  # of the search for a matrix; its first standard deviation
+# rounds, matrices in each round, and first standard deviation of the search for a matrix
+_ROUNDS, _TRIED, _REACH = 16, 100, 0.15
 _INTENSITY_SPREAD = 0.15  # standard deviation of the logarithm of unknown intensities
 
 
@@ -113,12 +115,13 @@ def lights_of_least_curl(
     *,
     intensities_known: bool,
 ) -> list[Lights]:
-    """Return lights under which a matte surface explains the images and its normals have little
-    curl, best first; none if too few pixels are lit.
+    """Return lights that explain the images of a matte surface by normals with little curl, best
+    first.
 
-    Each is the end of a search from another start, so several may be equal. The observations (P, F)
-    are linear, divided by known intensities. The mask (H, W) has P true pixels, in row-major order.
-    The guess is a weak witness; `errors_deg` (F,) are its expected errors.
+    Each is the result of a search from another start, so some may be equal. The list is empty if
+    too few pixels are lit. The observations (P, F) are linear, divided by known intensities. The
+    mask (H, W) has P true pixels, in row-major order. The guess has a low weight; `errors_deg` (F,)
+    are its expected errors.
     """
     images = _Images.of(observations / guess.intensities, mask)
     if images is None:
@@ -126,7 +129,7 @@ def lights_of_least_curl(
     rng = np.random.default_rng(0)
     factors = images.factors
     root = _root_of_metric(factors)
-    # the least residual of known intensities that is trusted
+    # the smallest standard deviation assumed for known intensities
     spread = max(0.02, 1.5 * images.unit_residual) if intensities_known else _INTENSITY_SPREAD
     guess_deg = np.asarray(errors_deg)
 
@@ -169,16 +172,18 @@ def lights_of_least_curl(
 
 
 def differ_by_deg(lights: Float64Array, others: Float64Array) -> float:
-    """Return the mean angle in degrees between lights (F, 3), bump and hollow being equal."""
+    """Return the mean angle in degrees between lights (F, 3), without distinguishing bump from
+    hollow.
+    """
     return float(min(angle_between_deg(lights * sign, others).mean() for sign in (1.0, OPPOSITE)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Images:
-    """The images of a matte surface: factors of rank 3, and the normals that belong to them."""
+    """The images of a matte surface, as factors of rank 3 and corresponding normals."""
 
-    factors: Float64Array  # (F, 3), orthonormal; multiplied with a matrix, they are the lights
-    vectors: Float64Array  # (3, p, 3), see normal_derivatives; the inverse makes them normals
+    factors: Float64Array  # (F, 3), orthonormal; the lights are the factors times a matrix
+    vectors: Float64Array  # (3, p, 3); the normals are these times its inverse
 
     @classmethod
     def of(cls, observations: Floats, mask: Bools) -> _Images | None:
@@ -198,7 +203,7 @@ class _Images:
         return None if vectors is None else cls(factors, vectors)
 
     def curls(self, matrices: Floats, part: int = 1) -> Float64Array:
-        """Return the curl (n,) of normals multiplied with matrices (n, 3, 3)."""
+        """Return the curls (n,) of the normals after multiplication by matrices (n, 3, 3)."""
         terms = curl_terms(
             self.vectors[:, ::part], matrices, least_z=_LEAST_Z, least_share=_LEAST_SHARE
         )
@@ -206,14 +211,16 @@ class _Images:
 
     @property
     def unit_residual(self) -> float:
-        """How far the lights are from equal lengths after the metric was fitted."""
+        """How much the lengths of the lights deviate from 1 after fitting the metric."""
         lengths = np.linalg.norm(self.factors @ _root_of_metric(self.factors), axis=1)
         return float(np.abs(lengths**2 - 1).mean())
 
 
 def _factorise(values: Float64Array) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return factors (F, 3) and rows (p, 3) whose product explains values (p, F), and the weights
-    (p, F) that shadows and highlights have.
+    """Return factors (F, 3) and rows (p, 3) whose product approximates values (p, F), and weights
+    (p, F).
+
+    Shadows and highlights have low weights.
     """
     lit = (values > SHADOW_SHARE).astype(np.float64)
     factors, weights = np.linalg.svd(values, full_matrices=False)[2][:3].T, lit
@@ -229,7 +236,7 @@ def _factorise(values: Float64Array) -> tuple[Float64Array, Float64Array, Float6
 
 
 def _root_of_metric(factors: Float64Array) -> Float64Array:
-    """Return the symmetric matrix (3, 3) that makes the factors (F, 3) most nearly unit vectors."""
+    """Return the symmetric matrix (3, 3) that brings the factors (F, 3) closest to unit vectors."""
     x, y, z = factors.T
     terms = np.stack((x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z), axis=1)
     weights = np.ones(len(factors))
@@ -237,7 +244,7 @@ def _root_of_metric(factors: Float64Array) -> Float64Array:
         metric = np.linalg.lstsq(terms * weights[:, None], weights, rcond=None)[0]
         weights = 1 / np.sqrt(1 + ((terms @ metric - 1) / 0.05) ** 2)
     values, axes = np.linalg.eigh(metric[[[0, 3, 4], [3, 1, 5], [4, 5, 2]]])
-    # Of metals and noisy images, it may have no root.
+    # For metals and noisy images, the metric may have no root.
     values = np.maximum(values, 0.05 * max(np.abs(values).max(), 1e-9))
     return np.asarray((axes * np.sqrt(values)) @ axes.T)
 
@@ -247,8 +254,9 @@ def _search(
     costs: Callable[[Float64Array], Float64Array],
     rng: np.random.Generator,
 ) -> tuple[Float64Array, float]:
-    """Return the matrix (3, 3) of least cost near a start, and its cost; see CMA-ES (Hansen and
-    Ostermeier, 2001).
+    """Return the matrix (3, 3) of least cost near a start, and its cost, by CMA-ES.
+
+    See Hansen and Ostermeier (2001).
     """
     best, least = start, float(costs(start[None])[0])
     covariance, middle = _REACH**2 * np.eye(9), np.zeros(9)

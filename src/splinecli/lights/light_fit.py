@@ -1,17 +1,17 @@
-"""How well images fit light directions, also in other orders of the lights, and rough directions
-refined by the images.
+"""How well images fit light directions, including other orders of the lights, and refinement of
+rough directions.
 
-The images of a matte object under F distant lights are a matrix of rank 3: observations = scaled
+The images of a matte object under F distant lights form a matrix of rank 3: observations = scaled
 normals times lights (Woodham 1980; Hayakawa, "Photometric stereo under a light source with
-arbitrary motion", JOSA A 1994). Its three factors are found without the lights. Correct lights are
-linear combinations of these factors in any frame. Lights in a wrong order are not.
+arbitrary motion", JOSA A 1994). Its three factors are computed without the lights. In any frame,
+correct lights are linear combinations of these factors. Lights in the wrong order are not.
 
-To refine lights, normals and lights are fitted in turn, robustly: with I = l . b for a matte
-surface, each step is linear. This is semi-calibrated photometric stereo (Cho et al., TPAMI 2018)
-with directions that are free, too, within a prior around the given ones. The prior fixes the
-remaining freedom: lights and normals may rotate together. If the light intensities are known, no
-other freedom remains. If not, a prior on them fixes the generalised bas-relief ambiguity
-(Belhumeur, Kriegman and Yuille, IJCV 1999).
+Refinement alternates between robust fits of the normals and of the lights. For a matte surface, I =
+l . b, so each step is linear. This is semi-calibrated photometric stereo (Cho et al., TPAMI 2018)
+in which the directions are also free, with a prior around the given ones. The prior fixes the
+remaining freedom, a common rotation of lights and normals. If the light intensities are unknown, a
+prior on them fixes the generalised bas-relief ambiguity (Belhumeur, Kriegman and Yuille, IJCV
+1999).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from splinecli.records.capture_warnings import REFINED_LIGHTS, REFINEMENT_REJECT
 LIT_SHARE = 0.1  # observations below this share of a pixel's largest one are treated as shadow
 MIN_PIXELS_PER_LIGHT = 10
 LIGHT_ERROR_DEG, LARGEST_LIGHT_ERROR_DEG = 5.0, 30.0  # usual and largest error of a rough direction
-FEWEST_TO_REFINE = 6  # with fewer lights, an error of a light looks like an error of the normals
+FEWEST_TO_REFINE = 6  # with fewer lights, normals can compensate for errors of the lights
 INTENSITY_ERROR = 0.15  # standard deviation of unmeasured intensities, in the prior
 _MIN_PIXELS = 100
 _PRIOR = 1e-9
@@ -40,35 +40,34 @@ _PRIOR = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Factors:
-    """The best factors of rank 3 of some observations."""
+    """The best factors of rank 3 of observations."""
 
-    # (3, F). Its rows are scaled by the share of the brightness that they explain, so that a
-    # distance between two such matrices is one between images, as a share of the mean brightness
+    # (3, F). The rows are scaled by the share of the brightness that they explain, so that the
+    # distance between two such matrices is a distance between images, relative to the mean
+    # brightness
     matrix: Float64Array
-    # (F,), RMS residual of each image after the fit of the factors, in this unit
+    # (F,), RMS residual of each image after fitting the factors, in the same unit
     image_residuals: Float64Array
     # whether the observations were divided by measured light intensities
     intensities_known: bool = True
 
     @property
     def residual(self) -> float:
-        """The residual of all images after the fit of the factors."""
+        """The residual of all images after fitting the factors."""
         return float(np.linalg.norm(self.image_residuals))
 
     def with_free_intensities(self) -> Factors:
-        """Return the factors of the same observations, to be compared with lights of any
+        """Return the factors of the same observations, for comparison with lights of any
         intensities.
         """
         return replace(self, intensities_known=False)
 
     def misfits(self, light_directions: Float64Array) -> Float64Array:
-        """Return the root mean square distances (N,) from the images that lights (N, F, 3) can
-        explain.
-        """
+        """Return the RMS distances (N,) from the closest images that lights (N, F, 3) explain."""
         if self.intensities_known:
             return self.distances(np.linalg.qr(light_directions)[0])
         found = []
-        # Parts that stay in the processor's cache save half of the time.
+        # Parts that fit into the processor's cache take half the time.
         for part in np.array_split(light_directions, light_directions.size // 30_000 + 1):
             intensities, matrices = self._fit_intensities(part)
             differences = self.matrix.T - intensities[..., None] * matrices
@@ -76,8 +75,8 @@ class Factors:
         return np.concatenate(found)
 
     def distances(self, bases: Float64Array) -> Float64Array:
-        """Return the root mean square distances (N,) from the images that orthonormal bases (N, F,
-        3) can explain.
+        """Return the RMS distances (N,) from the closest images that orthonormal bases (N, F, 3)
+        explain.
         """
         explained = ((self.matrix @ bases) ** 2).sum(axis=(1, 2))
         return np.asarray(np.sqrt(np.maximum((self.matrix**2).sum() - explained, 0)))
@@ -89,12 +88,9 @@ class Factors:
         return self._fit_intensities(light_directions)[0]
 
     def _fit_intensities(self, light_directions: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Return intensities (N, F), and the matrices (N, F, 3) that lights of intensity 1 would
-        give.
-        """
-        # Intensities and the 3 x 3 matrix between lights and factors are fitted in turn (Cho et
-        # al., TPAMI 2018). The weight of equal intensities against those that fit best, if none
-        # were measured.
+        """Return intensities (N, F), and the factors (N, F, 3) of lights of intensity 1."""
+        # Alternate between the intensities and the 3 x 3 matrix between lights and factors (Cho et
+        # al., TPAMI 2018), with a weak prior for equal intensities.
         prior = 0.01 * (self.matrix**2).sum(axis=0).mean()
         intensities = np.ones(light_directions.shape[:2])
         for _ in range(12):
@@ -109,10 +105,10 @@ class Factors:
 
 
 def find_factors(observations: Floats, *, intensities_known: bool = True) -> Factors | None:
-    """Return the factors of observations (P, F), or None if too few of them are lit.
+    """Return the factors of observations (P, F); None if too few of them are lit.
 
-    Shadows are left out, and highlights get small weights: least absolute deviations, by weighted
-    least squares.
+    The fit minimises absolute deviations by weighted least squares, so highlights have small
+    weights. Shadows are left out.
     """
     values = sample_pixels(observations)
     n_pixels, n_lights = values.shape
@@ -121,12 +117,12 @@ def find_factors(observations: Floats, *, intensities_known: bool = True) -> Fac
     lit = (values > LIT_SHARE).astype(np.float64)
     matrix = np.linalg.svd(values, full_matrices=False)[2][:3]
     weights = lit
-    for _ in range(8):  # more rounds fit the highlights of metals
+    for _ in range(8):  # further rounds would fit the highlights of metals
         rows = fit_scaled_normals(values, weights, matrix.T, prior=_PRIOR)
         matrix = fit_scaled_normals(values.T, weights.T, rows, prior=_PRIOR).T
         residuals = values - rows @ matrix
         weights = lit * absolute_weights(residuals)
-    # The largest values of a row are 1, but a few rows in deep shadow may be wild.
+    # The largest value of a row is about 1, except in a few rows in deep shadow.
     kept = np.abs(rows @ matrix).max(axis=1) < 3
     rows, residuals, lit = rows[kept], residuals[kept], lit[kept]
     if len(rows) < MIN_PIXELS_PER_LIGHT * n_lights:
@@ -138,19 +134,19 @@ def find_factors(observations: Floats, *, intensities_known: bool = True) -> Fac
 
 
 def random_misfits(factors: Factors, light_directions: Float64Array) -> Float64Array:
-    """Return the residuals of the lights (F, 3) in random orders, in ascending order."""
-    # A given order is compared with so many random ones.
+    """Return the ascending residuals of the lights (F, 3) in 250 random orders."""
     given = np.tile(np.arange(len(light_directions)), (250, 1))
     orders = np.random.default_rng(0).permuted(given, axis=1)
     if factors.intensities_known:
-        # One basis serves all orders, which saves most of the time.
+        # One basis for all orders saves most of the time.
         return np.sort(factors.distances(np.linalg.qr(light_directions)[0][orders]))
     return np.sort(factors.misfits(light_directions[orders]))
 
 
 def shifted_orders(n_lights: int) -> NDArray[np.int64]:
-    """Return the orders (2 F, F): all cyclic shifts, then all shifts of the reversed order; the
-    first is as given.
+    """Return the orders (2 F, F): all cyclic shifts of the given order, then those of its reverse.
+
+    The first one is the given order.
     """
     steps = np.arange(n_lights)
     forward = (steps[None] + steps[:, None]) % n_lights
@@ -167,10 +163,9 @@ def swapped_orders(n_lights: int) -> NDArray[np.int64]:
 
 
 def fit_residual(values: Float64Array, light_directions: Float64Array) -> float:
-    """Return the mean |difference| of lit values (p, F) from a fit of least absolute deviations
-    under lights (F, 3).
+    """Return the mean |residual| of lit values (p, F) after a robust fit under lights (F, 3).
 
-    It is a share of the mean of the lit values.
+    The fit minimises absolute deviations. The residual is relative to the mean of the lit values.
     """
     lit = (values > LIT_SHARE).astype(np.float64)
     normals, _ = fit_robustly(values, lit, light_directions, 5)
@@ -179,13 +174,13 @@ def fit_residual(values: Float64Array, light_directions: Float64Array) -> float:
 
 
 def sample_pixels(observations: Floats) -> Float64Array:
-    """Return lit pixels (p, F), each scaled to a largest observation of 1."""
+    """Return lit pixels (p, F), each scaled so that its largest observation is 1."""
     n_lights = observations.shape[1]
-    # Pixels below this share of the brightest hundredth are left out as background. The second
-    # share is used if the first leaves too few, because highlights outshine the object.
+    # Pixels below this share of the brightest hundredth are treated as background. If highlights
+    # outshine the object, the first share leaves too few pixels.
     for share in (0.1, 0.02):
         _, values = lit_values(observations, share, min(4000, max(120_000 // n_lights, 1)))
-        # Three unknowns need more than three lit observations to leave a residual.
+        # With three unknowns, only pixels with more than three lit observations have a residual.
         kept: Float64Array = values[(values > LIT_SHARE).sum(axis=1) >= 4]
         if len(kept) >= MIN_PIXELS_PER_LIGHT * n_lights:
             break
@@ -193,30 +188,29 @@ def sample_pixels(observations: Floats) -> Float64Array:
 
 
 class LightFit(NamedTuple):
-    """Lights that fit the images best near given ones."""
+    """Lights near the given ones that fit the images best."""
 
     directions: Float64Array  # (F, 3), unit
     # (F,), relative to the intensities by which the observations were divided
     intensities: Float64Array
-    # before, after: the median residuals under the given lights and under these, as shares of a
-    # pixel's brightest observation
+    # the median residuals before and after the fit, relative to a pixel's brightest observation
     before: float
     after: float
 
     @property
     def fit_ratio(self) -> float:
-        """The median residual, as a share of the median residual under the given lights."""
+        """The median residual after the fit divided by the one before."""
         return self.after / max(self.before, 1e-12)
 
 
 def refine_capture(
     capture: Capture, *, error_deg: float | None = None, intensities_known: bool = True
 ) -> Capture:
-    """Return the capture with refined lights, or unchanged if they do not fit much better. A
-    warning says which.
+    """Return the capture with refined lights, or unchanged if they do not fit much better.
 
-    `error_deg` is the usual error of the given directions, by default LIGHT_ERROR_DEG. Raises
-    UsageError if the capture has near lamps, or the error is not from 0 to LARGEST_LIGHT_ERROR_DEG.
+    A warning reports the result. `error_deg` is the usual error of the given directions, by default
+    LIGHT_ERROR_DEG. Raises UsageError if the capture has near lamps, or if the error is not between
+    0 and LARGEST_LIGHT_ERROR_DEG.
     """
     check_distant("--refine-lights", "refines", near=capture.lamps is not None)
     error_deg = LIGHT_ERROR_DEG if error_deg is None else error_deg
@@ -228,13 +222,13 @@ def refine_capture(
         intensities_known=intensities_known,
     )
     if found is None:
-        reason = "no directions near them fit the images much better"
+        reason = "no nearby directions fit the images much better"
         if capture.n_lights < FEWEST_TO_REFINE:
             reason = f"there are fewer than {FEWEST_TO_REFINE} lights"
         elif _choose_pixels(capture.observations) is None:
             reason = f"there are fewer than {_MIN_PIXELS} lit pixels"
         kept = CaptureWarning(
-            REFINEMENT_REJECTED, f"The light directions were not refined: {reason}."
+            REFINEMENT_REJECTED, f"The light directions were not refined, because {reason}."
         )
         return replace(capture, warnings=(*capture.warnings, kept))
     intensities = capture.estimated_intensities
@@ -242,9 +236,8 @@ def refine_capture(
         intensities = found.intensities if intensities is None else intensities * found.intensities
     moved_deg = angle_between_deg(found.directions, capture.light_directions)
     text = (
-        f"The light directions were refined: they moved by {moved_deg.mean():.1f} degrees on"
-        f" average, at most {moved_deg.max():.1f}, which reduces the residual to"
-        f" {100 * found.fit_ratio:.0f} %."
+        f"The light directions were refined by {moved_deg.mean():.1f} degrees on average, at most"
+        f" {moved_deg.max():.1f}, which reduces the residual to {100 * found.fit_ratio:.0f} %."
     )
     return replace(
         capture,
@@ -258,41 +251,41 @@ def refine_capture(
 def would_refine(
     observations: Floats, factors: Factors | None, light_directions: Float64Array
 ) -> LightFit | None:
-    """Return the lights that refinement would give if they fit observations (P, F) much better, or
+    """Return refined lights if they fit observations (P, F) much better than the given ones; else
     None.
 
-    It is cheap if the given lights (F, 3) fit well. See find_factors for the factors of the
-    observations.
+    This is fast if the given lights (F, 3) fit well. For the factors of the observations, see
+    find_factors.
     """
-    # Smallest residual of rough directions, as a share of the brightness. Below it, refinement is
-    # not tried only to be suggested. Few matte or shiny captures with exact lights exceed it.
+    # Few matte or shiny captures with exact lights have a residual above this share of the
+    # brightness. Below it, trying a refinement only to suggest it is not worth the time.
     if factors is None or factors.misfits(light_directions[None])[0] < 0.04:
         return None
-    # The directions are not to blame for unmeasured intensities.
+    # Residuals due to unmeasured intensities must not be attributed to the directions.
     intensities = factors.intensities(light_directions[None])[0]
     return refine_lights(np.asarray(observations / intensities, np.float32), light_directions)
 
 
 def check_distant(option: str, verb: str, *, near: bool) -> None:
-    """Raise UsageError for a capture with near lamps under an option that refines or finds distant
-    lights.
+    """Raise UsageError if an option that refines or finds distant lights is used with near
+    lamps.
     """
     if near:
         raise UsageError(
-            f"{option} {verb} distant lights, and this capture has near lamps",
+            f"{option} {verb} distant lights, but this capture has near lamps",
             hint=f"Leave {option} out",
         )
 
 
 def check_light_error(error_deg: float | None, *, refines: bool) -> None:
-    """Raise UsageError for a usual error of directions that is out of range, or given although none
-    are refined.
+    """Raise UsageError if the usual error of the directions is out of range, or given without
+    refinement.
     """
     if error_deg is None:
         return
     if not refines:
         raise UsageError(
-            "--light-error-deg needs --refine-lights", hint="Add it, or leave both out"
+            "--light-error-deg needs --refine-lights", hint="Add --refine-lights, or leave both out"
         )
     if not 0 < error_deg <= LARGEST_LIGHT_ERROR_DEG:
         raise UsageError(
@@ -308,11 +301,10 @@ def refine_lights(
     error_deg: float = LIGHT_ERROR_DEG,
     intensities_known: bool = True,
 ) -> LightFit | None:
-    """Return refined lights; None if the images do not determine them, or the given lights fit
-    about as well.
+    """Return refined lights; None if the images do not determine them or hardly improve the fit.
 
     The observations (P, F) are linear, divided by the light intensities; the directions (F, 3) are
-    unit. See refine_capture for the other arguments.
+    unit. For the other arguments, see refine_capture.
     """
     intensity_error = 0.0 if intensities_known else INTENSITY_ERROR
     fit = fit_near(
@@ -324,10 +316,9 @@ def refine_lights(
     )
     if fit is None:
         return None
-    # Refined lights are taken if the median residual falls below the second share of that under the
-    # given lights. On rendered captures with exact lights, it seldom does; docs/measurements.md has
-    # the figures. Metals have a larger residual than the first, and a matte model would move their
-    # lights wrongly.
+    # Refined lights are used if they reduce the median residual to 70 %, which seldom happens on
+    # rendered captures with exact lights (docs/measurements.md). The absolute limit excludes
+    # metals, for which a matte model would refine the lights wrongly.
     better = fit.after < 0.018 and fit.fit_ratio < 0.7 and bool((fit.directions[:, 2] > 0).all())
     return fit if better else None
 
@@ -341,12 +332,13 @@ def fit_near(
     worth_pixels: float,
 ) -> LightFit | None:
     """Return the lights near the given ones that fit the images best; None for too few lights or
-    lit pixels.
+    pixels.
 
     The observations (P, F) are linear, and the directions (F, 3) are unit. `error_deg` is the usual
-    error of each direction (F,), or of all; `intensity_error` is a share, 0 for known intensities.
-    `worth_pixels` is the number of pixels that the images weigh against the prior, because errors
-    of a matte model are alike in many.
+    error of each direction (F,), or of all of them; `intensity_error` is relative, 0 for known
+    intensities. `worth_pixels` is the number of independent pixels that the images are worth
+    relative to the prior. It is small because the errors of a matte model are similar in many
+    pixels.
     """
     values = _choose_pixels(observations)
     if values is None:
@@ -355,9 +347,9 @@ def fit_near(
     lit = (values > reference).astype(np.float64)
     lights = light_directions
     normals, weights = fit_robustly(values, lit, lights, 8)
-    before = _misfit(values, normals, lights, lit)
-    # The precision (F, 3, 3) of the given light vectors, along and across them. The angle has two
-    # components, each with half of its variance.
+    before = _residual(values, normals, lights, lit)
+    # The precision (F, 3, 3) of the given light vectors, along and across them. Both components of
+    # the angle have half of its variance.
     along = lights[:, :, None] * lights[:, None, :]
     across_variance = np.broadcast_to(np.radians(error_deg) ** 2 / 2, len(along))[:, None, None]
     precision = (np.eye(3) - along) / across_variance + along / (
@@ -367,7 +359,7 @@ def fit_near(
         normals, weights = fit_robustly(values, lit, lights, 2, weights)
         residuals = values - normals @ lights.T
         variance = (weights * residuals**2).sum() / weights.sum()
-        # A light that does not reach any pixel keeps its given vector.
+        # A light that reaches no pixel keeps its vector.
         scale = worth_pixels / (weights.sum(axis=0).clip(min=1) * max(variance, 1e-12))
         curvature = (
             np.einsum("pf,pi,pj->fij", weights, normals, normals, optimize=True)
@@ -381,21 +373,19 @@ def fit_near(
         if change < 1e-4:
             break
     normals, _ = fit_robustly(values, lit, lights, 8, weights)
-    after = _misfit(values, normals, lights, lit)
+    after = _residual(values, normals, lights, lit)
     return LightFit(unit(lights), np.linalg.norm(lights, axis=1), before, after)
 
 
 def _choose_pixels(observations: Float32Array) -> Float64Array | None:
-    """Return observations (p, F) of lit pixels, each scaled to a largest value of 1; None for too
-    few.
-    """
+    """Return observations (p, F) of lit pixels, each scaled to a maximum of 1; None for too few."""
     if observations.shape[1] < FEWEST_TO_REFINE:
         return None
     _, values = lit_values(observations, 0.02, 2000)
     return values.clip(min=0) if len(values) >= _MIN_PIXELS else None
 
 
-def _misfit(
+def _residual(
     values: Float64Array, normals: Float64Array, lights: Float64Array, lit: Float64Array
 ) -> float:
     return float(np.median(np.abs(values - normals @ lights.T)[lit > 0]))

@@ -25,13 +25,13 @@ class LightGuess(NamedTuple):
     sharpness: Tensor  # (B, F), the logarithms of the concentrations of these distributions
     # (B, F), the logarithms of the intensities; their mean over each capture is zero
     log_intensities: Tensor
-    # (B,), the logit that the object is a bump, not a hollow; the shipped weights were not trained
-    # for it
+    # (B,), the logit that the object is a bump rather than a hollow; the shipped weights were not
+    # trained to predict it
     bump: Tensor
 
 
 class LightNet(nn.Module):
-    """An encoder, shared by all images, that exchanges information between the images at three
+    """An encoder shared by all images, which exchanges information between the images at three
     depths.
 
     At each depth, the features of an image are concatenated with the maximum and the mean over all
@@ -83,8 +83,8 @@ class LightNet(nn.Module):
 
 
 def _with_all(x: Tensor, lights: int) -> Tensor:
-    """Concatenate features (B * F, C, ...) of images with their maximum and mean over the images of
-    each capture.
+    """Concatenate features (B * F, C, ...) with their maximum and mean over the images of each
+    capture.
     """
     each = x.view(-1, lights, *x.shape[1:])
     largest, mean = each.amax(dim=1, keepdim=True), each.mean(dim=1, keepdim=True)
@@ -92,12 +92,12 @@ def _with_all(x: Tensor, lights: int) -> Tensor:
 
 
 def network_inputs(images: Tensor, mask: Tensor) -> Tensor:
-    """Return the input channels (F, INPUTS, H, W) for images (F, H, W): linear, non-negative, of
-    any scale.
+    """Return the input channels (F, INPUTS, H, W) for linear, non-negative images (F, H, W) of any
+    scale.
 
-    Channels: the image; the image divided by the mean of all images, which hardly depends on the
-    material; that mean; and the mask (H, W), 1 on the object, else 0. The first and the third are
-    square roots, relative to the object's mean brightness.
+    The channels are the image; the ratio between the image and the mean of all images, which hardly
+    depends on the material; this mean; and the mask (H, W), 1 on the object and 0 elsewhere. The
+    image and the mean are square roots, relative to the object's mean brightness.
     """
     images = images * mask
     mean = images.mean(dim=0)
@@ -110,10 +110,10 @@ def network_inputs(images: Tensor, mask: Tensor) -> Tensor:
 
 def square_images(images: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     """Crop images (F, H, W) to the bounding box of a mask (H, W), pad them to squares and resize
-    them to SIDE.
+    them.
 
-    Returns images (F, SIDE, SIDE), means over the mask's pixels, and the mask (SIDE, SIDE) as zeros
-    and ones.
+    Returns images (F, SIDE, SIDE), averaged over the mask's pixels, and the mask (SIDE, SIDE) as
+    zeros and ones.
     """
     rows, columns = (mask.any(dim=1 - axis).nonzero()[:, 0] for axis in (0, 1))
     box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
@@ -131,6 +131,6 @@ def square_images(images: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
 
 @cache
 def light_net() -> LightNet:
-    """Load the light network (float32, evaluation mode). Raises ModelError."""
+    """Return the light network (float32, evaluation mode). Raises ModelError."""
     with resources.as_file(SHIPPED / LIGHT_NET) as path:
         return load_module(LightNet(), path, LIGHT_FORMAT).float().eval()

@@ -1,17 +1,16 @@
-"""The light of near lamps on a surface: points in space, and observations as distant lamps would
-give them.
+"""The light of near lamps on a surface, and indirect light from other parts of the object.
 
-Light that reaches a pixel from other parts of the object, gathered from the photographs themselves.
+Near lamps: surface points in space, and observations converted to those under distant lamps.
 
-The photographs show how bright each visible part of the object is under each light, after all
-reflections. A matte part is as bright from all sides. Estimated normals give the surface. Together
-they give the light that arrives at a pixel from the rest of the object, and the pixel reflects it.
-(Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV 1991, also alternate between the
-shape and the light on it.)
+Indirect light is gathered from the photographs, which show how bright each visible part of the
+object is under each light, including all reflections. A matte part has the same brightness from all
+sides. With the surface from estimated normals, this determines the light that arrives at a pixel
+from the rest of the object and is reflected there. (Nayar, Ikeuchi and Kanade, "Shape from
+interreflections", IJCV 1991, also alternate between the shape and the light on it.)
 
-Two things are unknown: the exposure, that is the observation for an albedo of 1, and whether the
-object is matte enough. Attached shadows show both, because a pixel reflects only indirect light if
-the lamp is behind its tangent plane.
+Two things are unknown: the exposure, which is the observation for an albedo of 1, and whether the
+object is matte enough. Attached shadows reveal both, because a pixel reflects only indirect light
+if the lamp is behind its tangent plane.
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ def surface_points(lamps: NearLamps, rows: Floats, columns: Floats, depth: Float
     """Return the points (N, 3) of a surface, in the unit of the lamps' positions.
 
     Rows and columns (N,) are in pixels; (0, 0) is the centre of the first pixel. The depth (N,) is
-    as integrate_normals returns it: the height in pixels, or with a camera matrix the depth, here
-    in multiples of the mean plane's depth.
+    defined as in integrate_normals: the height in pixels; with a camera matrix, the depth in
+    multiples of the mean plane's depth.
     """
     if lamps.camera_matrix is None:
         middle_row, middle_column = lamps.middle
@@ -54,18 +53,20 @@ def flat_depth(lamps: NearLamps) -> float:
 
 @dataclass(frozen=True)
 class PixelLighting:
-    """Observations as distant lamps would give them, with the light directions of each pixel."""
+    """Observations converted to those under distant lamps, with the light directions of each
+    pixel.
+    """
 
-    observations: Float32Array  # (P, F), without the falloff of the lamps
-    # unit; (P, F, 3) in each pixel's own frame, whose z axis points to the camera, or (F, 3) for
+    observations: Float32Array  # (P, F), without the attenuation with the lamps' distances
+    # unit; (P, F, 3) in each pixel's own frame, whose z axis points to the camera; or (F, 3) for
     # distant lights and an orthographic camera
     directions: Floats
-    # (P, 3, 3), rotations from the capture's frame to these; None if all are equal
+    # (P, 3, 3), rotations from the capture's frame to the pixels' frames; None if all are equal
     turns: Float32Array | None = None
 
     @classmethod
     def of(cls, observations: Float32Array, lamps: NearLamps) -> PixelLighting:
-        """Return the light on the points of `lamps`, from observations (P, F)."""
+        """Return the light at the surface points of `lamps`, from observations (P, F)."""
         assert lamps.points is not None
         directions, attenuation = lamps.light_at(lamps.points)
         turns = None
@@ -76,8 +77,8 @@ class PixelLighting:
 
     @classmethod
     def distant(cls, observations: Float32Array, directions: Floats, rays: Floats) -> PixelLighting:
-        """Return the light of distant lamps, from directions (F, 3), on pixels with rays (P, 3)
-        from the camera.
+        """Return the light of distant lamps in directions (F, 3), for pixels with camera rays (P,
+        3).
         """
         turns = _turns_to_view(unit(-rays)).astype(np.float32)
         return cls(
@@ -85,41 +86,41 @@ class PixelLighting:
         )
 
     def in_frame_of_pixels(self, normals: Floats) -> Floats:
-        """Return normals (P, 3), given in the capture's frame, in the pixels' own."""
+        """Return normals (P, 3), given in the capture's frame, in the frames of the pixels."""
         return normals if self.turns is None else np.einsum("pij,pj->pi", self.turns, normals)
 
     def in_frame_of_capture(self, vectors: Floats) -> Floats:
-        """Return normals (P, 3) or directions (P, F, 3), given in the pixels' own frames, in the
-        capture's.
+        """Return normals (P, 3) or directions (P, F, 3), given in the pixels' frames, in the
+        capture's frame.
         """
         return vectors if self.turns is None else np.einsum("pji,p...j->p...i", self.turns, vectors)
 
 
-PixelIndices = Integers  # numbers of some of a capture's pixels, in the order of its mask
-# From rows of a capture's pixels to their observations and light directions.
+PixelIndices = Integers  # indices of a capture's pixels, in the order of its mask
+# Maps the indices of pixels to their observations and light directions.
 LightingAt = Callable[[PixelIndices], PixelLighting]
-# Pixels whose light is requested at once, because under near lamps each has its own lights
+# Number of pixels whose light is requested at once; under near lamps, each has its own lights
 LIT_AT_ONCE = 1 << 14
 
 
 def parts_of_pixels(
     count: int, size: int = LIT_AT_ONCE, *, step: int = 1
 ) -> Iterator[PixelIndices]:
-    """Yield every step-th of the rows below `count`, `size` at a time."""
+    """Yield every step-th index below `count`, `size` at a time."""
     for start in range(0, count, step * size):
         yield np.arange(start, min(start + step * size, count), step)
 
 
 def _plane_distance(lamps: NearLamps) -> float:
-    """Return the distance of the mean plane from the camera, from the width of a pixel there."""
+    """Return the distance between the camera and the mean plane, from the width of a pixel
+    there.
+    """
     assert lamps.camera_matrix is not None
     return focal_length(lamps.camera_matrix) * lamps.pixel_size
 
 
 def _camera_position(lamps: NearLamps) -> Floats:
-    """Return the camera's position (3,): the middle of the image shows the origin, at the distance
-    of the mean plane.
-    """
+    """Return the camera's position (3,), from which the origin is in the middle of the image."""
     assert lamps.camera_matrix is not None
     row, column = lamps.middle
     middle = np.array((column, row, 1.0)) @ ray_basis(lamps.camera_matrix)
@@ -127,15 +128,15 @@ def _camera_position(lamps: NearLamps) -> Floats:
 
 
 def _turns_to_view(views: Floats) -> Floats:
-    """Return the shortest rotations (P, 3, 3) of unit vectors (P, 3) with z > 0 onto the z axis."""
+    """Return the shortest rotations (P, 3, 3) of unit vectors (P, 3) with z > 0 to the z axis."""
     x, y, z = views.T
     a, b, c = x * x / (1 + z), x * y / (1 + z), y * y / (1 + z)
     return np.stack((1 - a, -b, -x, -b, 1 - c, -y, x, y, z), axis=1).reshape(-1, 3, 3)
 
 
 class PixelPlaces:
-    """Rows and columns of the pixels of a mask. Two bytes per pixel, because captures may have
-    many.
+    """Rows and columns of the pixels of a mask, stored in two bytes per pixel for large
+    captures.
     """
 
     def __init__(self, mask: Bools) -> None:
@@ -144,7 +145,7 @@ class PixelPlaces:
         self._ends = np.count_nonzero(mask, axis=1).cumsum()
 
     def places(self, pixels: PixelIndices) -> tuple[PixelIndices, PixelIndices]:
-        """Return the rows and columns (n,) in the image of pixels with these numbers."""
+        """Return the rows and columns (n,) of pixels with these indices."""
         return np.searchsorted(self._ends, pixels, side="right"), self._columns[pixels]
 
 
@@ -152,44 +153,43 @@ class PixelPlaces:
 class IndirectLight:
     """The indirect light of a capture with P pixels."""
 
-    blocks: Blocks  # of the mask's pixels
-    # (h, w, F), the light at each block from the others. Other cells copy the nearest block
+    blocks: Blocks  # blocks of the mask's pixels
+    # (h, w, F), the light that each block receives from the others. Cells without a block copy the
+    # nearest one
     arriving: Float32Array
     albedo: Floats  # (P,), the share of the arriving light that a pixel reflects
     pixels: PixelPlaces
 
     def at(self, pixels: PixelIndices) -> Float32Array:
-        """Return the indirect part (n, F) of the observations of some of the capture's pixels."""
+        """Return the indirect part (n, F) of the observations of these pixels."""
         arriving = self.blocks.sample(self.arriving, *self.pixels.places(pixels))
         return np.asarray(arriving * self.albedo[pixels, None], np.float32)
 
     def remove(self, observations: Float32Array, pixels: PixelIndices) -> Float32Array:
-        """Return the observations (n, F) of some of the capture's pixels without their indirect
-        part.
-        """
-        # Keep a share of each observation, because the gathered light is never exact.
+        """Return the observations (n, F) of these pixels without their indirect part."""
+        # Keep a share of each observation, because the gathered light is not exact.
         return np.asarray(
             np.maximum(observations - self.at(pixels), 0.02 * observations), np.float32
         )
 
     def counts_at(self, observations: Float32Array, pixels: PixelIndices) -> Bools:
-        """Return whether the indirect part is not negligible (n,) for some pixels with observations
-        (n, F).
+        """Return whether the indirect part of pixels (n,) with observations (n, F) is
+        significant.
         """
-        # Indirect light up to this share of a pixel's largest observation changes mean errors by
-        # 0.01 degrees at most.
+        # Less indirect light, relative to a pixel's largest observation, changes mean errors by at
+        # most 0.01 degrees.
         return np.asarray(self.at(pixels).max(axis=1) > 0.02 * observations.max(axis=1))
 
 
 def find_indirect_light(
     mask: Bools, observations: Float32Array, lighting_at: LightingAt, normals: Float32Array
 ) -> IndirectLight | None:
-    """Return the indirect light of a capture, or None if the attached shadows show none that could
-    be removed.
+    """Return the indirect light of a capture; None if attached shadows show none that can be
+    removed.
 
     The camera is always treated as orthographic, because only nearby parts exchange much light. The
-    mask (H, W) has P true pixels. The observations (P, F) are as they were photographed, divided by
-    the intensities alone; `lighting_at` gives them without the falloff of near lamps, and the light
+    mask (H, W) has P true pixels. The observations (P, F) are divided only by the light
+    intensities; `lighting_at` also removes the attenuation of near lamps, and returns the light
     directions. The normals (P, 3) are unit, in the capture's frame.
     """
     pixels = PixelPlaces(mask)
@@ -205,7 +205,7 @@ def find_indirect_light(
     total = float(albedo.sum(dtype=np.float64))
     if total <= 0:
         return None
-    # A mean that hardly depends on how much dark background there is.
+    # This mean hardly depends on the amount of dark background.
     bright = float(albedo @ albedo) / total
     lit = albedo > 0.02 * bright  # darker ones are background
     object_mask = mask.copy()
@@ -215,8 +215,8 @@ def find_indirect_light(
 
     def sum_up(rows: PixelIndices) -> Float64Array:
         rows = rows[lit[rows]]
-        # A block sends at most this many times the light of a matte one that faces the lamp. The
-        # rest is a highlight, which goes in another direction.
+        # Limit the light that a block sends to this multiple of a matte block that faces the lamp.
+        # The rest is a highlight, which is reflected in another direction.
         most = 3.0 * albedo[rows, None]
         sent = observations[rows] * (most / lighting_at(rows).observations.clip(min=most))
         number = blocks.numbers_at(*pixels.places(rows))
@@ -231,18 +231,17 @@ def find_indirect_light(
     exposure = _exposure(indirect, observations, lighting_at, normals)
     if exposure is None:
         return None
-    # This quantile of the albedos is at most so large. It may exceed 1, because the gathered light
-    # is too weak if the reflecting surface is hidden from the camera.
+    # Limit this quantile of the albedo. It may exceed 1, because the gathered light is too weak if
+    # the camera does not show the reflecting surface.
     exposure = min(exposure, 1.4 / float(np.quantile(albedo[lit], 0.98)))
-    # Pixels that all lamps graze may have any albedo.
+    # The albedo of pixels at grazing angles to all lamps is arbitrary.
     return replace(indirect, albedo=(exposure * albedo).clip(max=10.0).astype(np.float16))
 
 
 def _exchange(
     blocks: Blocks, covered: Float64Array, normals: Float64Array, sent: Float64Array
 ) -> Float32Array:
-    """Return the light (p, F) that arrives at each block from the others, relative to the light
-    that a white block reflects.
+    """Return the light (p, F) that each block receives from the others, relative to a white block.
 
     Occlusion between blocks is ignored. `covered` (p,) is the share of each block that the mask
     covers, `normals` (p, 3) are unit, and `sent` (p, F) is the radiance of each block.
@@ -251,8 +250,7 @@ def _exchange(
     rows, columns = np.nonzero(blocks.mask)
     places = np.stack((columns, -rows, heights), axis=1)
     towards = (places - places[:, None]).astype(np.float32)
-    # Add half the side of a block, because neighbours exchange light over their whole area, not
-    # only their centres.
+    # Half the side of a block is added, because neighbours exchange light over their whole area.
     square = np.square(towards).sum(axis=-1) + 0.5**2
     facing = normals.astype(np.float32)
     leaving = -np.einsum("ijk,jk->ij", towards, facing).clip(max=0)
@@ -271,12 +269,11 @@ def _exposure(
     lighting_at: LightingAt,
     normals: Float32Array,
 ) -> float | None:
-    """Return the factor from albedos in the observations' unit to true ones; None without visible
-    indirect light.
+    """Return the factor from albedos in the unit of the observations to true albedos.
 
-    It is fitted to the attached shadows, together with ambient light that arrives everywhere alike.
-    In a round bowl under a ring of lights, indirect light is just as uniform, and the fit assigns
-    it to the indirect part.
+    None without visible indirect light. The factor is fitted to attached shadows, together with
+    uniform ambient light. In a round bowl under a ring of lights, indirect light is just as
+    uniform, and the fit attributes it to the indirect part.
     """
     found = []
     step = max(1, len(normals) // 50_000)
@@ -292,12 +289,12 @@ def _exposure(
         return None
     with np.errstate(invalid="ignore"):  # black shadows have no correlation
         correlation = np.corrcoef(seen, gathered)[0, 1]
-    # Correlation of attached shadows and gathered light. Below it, the object is not matte: on
-    # rendered scenes, metal.
+    # With a lower correlation between attached shadows and gathered light, the object is not matte
+    # (metal, on rendered scenes).
     if not correlation >= 0.6:
         return None
     exposure = float(seen @ gathered / (gathered @ gathered))
-    # If gathered and ambient light are more alike, they cannot be separated.
+    # Gathered and ambient light can only be separated if they are not too similar.
     if gathered @ albedo < 0.998 * np.linalg.norm(gathered) * np.linalg.norm(albedo):
         design = np.stack((gathered, albedo), axis=1)
         with_ambient, ambient = np.linalg.lstsq(design, seen, rcond=None)[0]

@@ -1,8 +1,8 @@
-"""The outline of the object, and the common rotation of lights and normals that it shows.
+"""The outline of the object, and the common rotation of lights and normals that it reveals.
 
-Where a smooth surface curves away from the camera, its normals are perpendicular to the view and to
-the outline. A rotation of all lights rotates all normals with them, including the normals at the
-outline.
+Where a smooth surface curves away from the camera, its normals are perpendicular to the viewing
+direction and to the outline. If all lights are rotated, so are all estimated normals, including the
+normals at the outline.
 """
 
 from typing import NamedTuple
@@ -14,14 +14,14 @@ from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.maths.normals import unit
 from splinecli.maths.robust import fit_robustly
 
-DARK_SHARE = 0.02  # of the brightest hundredth
+DARK_SHARE = 0.02  # pixels below this share of the brightest hundredth are dark
 
 
 class OutlineTurn(NamedTuple):
-    """A rotation that turns the normals at the outline outwards."""
+    """A rotation after which the normals at the outline point outwards."""
 
     rotation: Float64Array  # (3,), the rotation vector of lights and normals
-    # median absolute residual in z of these normals; small if a smooth surface forms the outline
+    # median absolute residual of the normals' z; small if the outline is formed by a smooth surface
     spread: float
 
     @property
@@ -30,7 +30,7 @@ class OutlineTurn(NamedTuple):
         return float(np.degrees(np.linalg.norm(self.rotation)))
 
     def share(self, part: float) -> Float64Array:
-        """Return a part of the rotation (3, 3), from 0 to 1."""
+        """Return the matrix (3, 3) of a fraction of the rotation, from 0 to 1."""
         from scipy.spatial.transform import Rotation
 
         return np.asarray(Rotation.from_rotvec(part * self.rotation).as_matrix())
@@ -39,16 +39,16 @@ class OutlineTurn(NamedTuple):
 def turn_at_outline(
     observations: Floats, mask: Bools, light_directions: Float64Array
 ) -> OutlineTurn | None:
-    """Return the rotation of the lights that the outline shows, or None. The border of the image is
-    ignored.
+    """Return the rotation of the lights that the outline reveals; None if too few pixels show it.
 
-    The observations (P, F) are linear, divided by the light intensities. The mask (H, W) has P true
-    pixels, in row-major order, and the directions (F, 3) are unit.
+    The border of the image is ignored. The observations (P, F) are linear, divided by the light
+    intensities. The mask (H, W) has P true pixels, in row-major order, and the directions (F, 3)
+    are unit.
     """
     from scipy.spatial.transform import Rotation
 
     normals, outwards = _rim(observations, mask, light_directions)
-    if len(normals) < 20:  # fewer lit pixels at the outline show no rotation
+    if len(normals) < 20:  # too few lit pixels at the outline
         return None
     along = np.cross((0.0, 0.0, 1.0), outwards)
     turn = Rotation.identity()
@@ -56,7 +56,7 @@ def turn_at_outline(
         turned = turn.apply(normals)
         # A small rotation w adds w x n. The first residual is along the view axis, the second along
         # the outline. Normals within a pixel of the outline have a z of about 0.25, because pixels
-        # have a size and masks end inside.
+        # have an extent and masks end inside the object.
         residuals = np.stack((turned[:, 2] - 0.25, (turned * along).sum(axis=1)))
         slopes = np.stack((np.cross(turned, (0.0, 0.0, 1.0)), np.cross(turned, along)))
         weights = 1 / (np.abs(residuals) + 0.1)
@@ -69,25 +69,23 @@ def turn_at_outline(
 
 
 def is_outlined(mask: Bools) -> bool:
-    """Return whether a mask (H, W) shows the outline of the object, which else extends beyond the
+    """Return whether a mask (H, W) contains the outline of the object, which then fits into the
     image.
     """
     return outline_share(mask) >= 0.5
 
 
 def outline_share(mask: Bools) -> float:
-    """Return the share of the outer boundary of a mask (H, W) that is not at or near the border of
-    the image.
-    """
+    """Return the share of a mask's (H, W) outer boundary that is not at the border of the image."""
     boundary = _boundary(mask)
-    # Masks of objects that fill the image may leave out a border of this share of its sides
+    # Masks of objects that fill the image may leave out a border of this width
     rows, columns = (1 + round(0.01 * side) for side in mask.shape)
     inside = boundary[rows:-rows, columns:-columns]
     return int(np.count_nonzero(inside)) / max(int(np.count_nonzero(boundary)), 1)
 
 
 def _boundary(mask: Bools) -> Bools:
-    """Return the pixels of a mask (H, W) at its outer boundary; holes have none."""
+    """Return the pixels of a mask (H, W) at its outer boundary, without its holes."""
     from scipy.ndimage import binary_erosion, binary_fill_holes
 
     filled = binary_fill_holes(mask)
@@ -97,13 +95,13 @@ def _boundary(mask: Bools) -> Bools:
 def _rim(
     observations: Floats, mask: Bools, light_directions: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the normals (p, 3) of lit pixels at the outline, and the directions (p, 3) outwards,
-    with z = 0.
+    """Return the normals (p, 3) of lit pixels at the outline, and outward directions (p, 3) with z
+    = 0.
     """
     rim = _boundary(mask)
     rim[[0, -1]] = rim[:, [0, -1]] = False
-    # Width of the Gaussian filter of the mask, as a share of the root of its area. The filtered
-    # mask falls outwards.
+    # The filtered mask decreases outwards. The width of the Gaussian filter is a share of the
+    # square root of the mask's area.
     width = max(1.5, 0.02 * float(np.sqrt(np.count_nonzero(mask))))
     outwards = np.pad(outward_directions(np.pad(mask, 1), width)[1:-1, 1:-1][rim], ((0, 0), (0, 1)))
     values = observations[rim[mask]].astype(np.float64)

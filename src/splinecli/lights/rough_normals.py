@@ -1,15 +1,13 @@
-"""Rough normals under given lights: evidence on the frame of the lights, and on bumps and hollows,
-by cast shadows.
+"""Rough normals under given lights, and what they and cast shadows reveal about the lights.
 
-The normals that lights give show whether the lights are in the right frame. Lights in a wrong frame
-fit the images as well as correct ones. But normals of a surface have no curl (Horn, "Shape from
-shading", 1970; Belhumeur, Kriegman and Yuille, "The bas-relief ambiguity", IJCV 1999), and they
-point outwards at the outline of the object (Ikeuchi and Horn 1981).
+Lights in a wrong frame fit the images as well as correct ones. But the normals of a surface have no
+curl (Horn, "Shape from shading", 1970; Belhumeur, Kriegman and Yuille, "The bas-relief ambiguity",
+IJCV 1999), and they point outwards at the outline of the object (Ikeuchi and Horn 1981). Therefore,
+the normals show whether the lights are in the right frame.
 
-The shadows that a surface casts on itself distinguish bumps from hollows. Negating x and y of all
-lights gives the normals of the surface with its depth inverted. It has the same shading and the
-same attached shadows (Belhumeur, Kriegman and Yuille, IJCV 1999), but it casts shadows in other
-places.
+The shadows that a surface casts on itself distinguish bumps from hollows. If x and y of all lights
+are negated, the normals belong to the surface with its depth inverted. Shading and attached shadows
+remain the same (Belhumeur, Kriegman and Yuille, IJCV 1999), but cast shadows move.
 """
 
 from __future__ import annotations
@@ -22,13 +20,13 @@ from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.robust import fit_robustly, shadow_weights
 
-# standard deviation in pixels of the smoothing of the normals before they are differentiated
+# standard deviation in pixels for smoothing the normals before they are differentiated
 SMOOTHING = 1.5
 RIM_PIXELS = 3  # width of the rim inside the outline, in pixels
 # a rim pixel is considered steep if its normal is at least 45 degrees from the viewing direction
 STEEP_Z = 0.7
-_LOWEST_Z = 0.2  # slopes grow without bound towards the outline
-_FITS = 5  # weighted fits to a pixel
+_LOWEST_Z = 0.2  # limits slopes, which are unbounded towards the outline
+_FITS = 5  # weighted fits for each pixel
 _TURNED_PIXELS = 2000
 
 
@@ -43,23 +41,23 @@ class RoughNormals:
 
     @property
     def rim_steepness(self) -> float:
-        """The share of the rim's pixels that are steep. It does not depend on the frame of the
+        """The share of the rim's pixels that are steep. It is the same in all frames of the
         lights.
         """
         rim = self.outward.any(axis=2)
         return float((self.normals[rim][:, 2] < STEEP_Z).mean()) if rim.any() else 0.0
 
     def transformed(self, matrix: Float64Array) -> RoughNormals:
-        """Return the normals that the lights would give after a multiplication with a matrix (3,
-        3).
-        """
+        """Return the normals for lights multiplied by a matrix (3, 3)."""
         normals = self.normals @ np.linalg.inv(matrix)
         return RoughNormals(
             np.where(self.mask[..., None], unit(normals), 0.0), self.mask, self.outward
         )
 
     def curl(self) -> float:
-        """Return the median |curl| of the slopes over their median derivative: 0 for a surface."""
+        """Return the median |curl| of the slopes divided by their median derivative; 0 for a
+        surface.
+        """
         if (found := self._derivatives_inside()) is None:
             return float("nan")
         (p_x, p_y), (q_x, q_y) = found
@@ -67,11 +65,12 @@ class RoughNormals:
         return float(np.median(np.abs(p_y - q_x)) / max(np.median(size), 1e-12))
 
     def least_curl_deg(self, *, mirrored: bool) -> float:
-        """Return the angle in degrees, -90 to 89, by which to rotate the lights so that the normals
-        have the least curl.
+        """Return the rotation of the lights that minimises the curl of the normals, in degrees, -90
+        to 89.
 
-        They rotate about the view axis, from x to y; if `mirrored`, their x is negated first. A
-        rotation by 180 degrees more has the same curl. NaN if the mask has too few pixels.
+        The lights rotate about the view axis, from x to y; if `mirrored`, their x is negated first.
+        After a further rotation by 180 degrees, the curl is the same. NaN if the mask has too few
+        pixels.
         """
         if (found := self._derivatives_inside()) is None:
             return float("nan")
@@ -86,8 +85,9 @@ class RoughNormals:
     def _derivatives_inside(
         self,
     ) -> tuple[tuple[Float64Array, Float64Array], tuple[Float64Array, Float64Array]] | None:
-        """Return the derivatives (n,) of both slopes to the right and upwards at inner pixels; None
-        for too few.
+        """Return the derivatives (n,) of both slopes to the right and upwards at inner pixels.
+
+        None for too few pixels.
         """
         from scipy.ndimage import binary_erosion
 
@@ -99,10 +99,11 @@ class RoughNormals:
         return (p[0][inside], p[1][inside]), (q[0][inside], q[1][inside])
 
     def rim(self) -> float:
-        """Return the mean cosine, in the image, between normals and the outward direction at steep
-        pixels of the rim.
+        """Return the mean cosine, in the image plane, between normals and the outward direction at
+        the rim.
 
-        It is 1 for a closed convex outline, 0 if one axis is flipped, and -1 if both are.
+        Only steep pixels are used. The mean is 1 for a closed convex outline, 0 if one axis is
+        flipped, and -1 if both are.
         """
         steep = self.outward.any(axis=2) & (self.normals[..., 2] < STEEP_Z)
         if not steep.any():
@@ -114,7 +115,7 @@ class RoughNormals:
 def rough_normals(
     observations: Floats, light_directions: Float64Array, mask: Bools
 ) -> RoughNormals:
-    """Return smoothed normals of a fit of least absolute deviations.
+    """Return smoothed normals from a robust fit that minimises absolute deviations.
 
     Observations are (P, F), at the pixels of a mask (H, W); light directions (F, 3).
     """
@@ -122,8 +123,9 @@ def rough_normals(
 
 
 def fitted_normals(observations: Floats, light_directions: Float64Array) -> Float64Array:
-    """Return unit normals (P, 3) of a fit of least absolute deviations to observations (P, F) under
-    lights (F, 3) or (P, F, 3).
+    """Return unit normals (P, 3) that fit observations (P, F) with the least absolute deviations.
+
+    Lights are (F, 3) or (P, F, 3).
     """
     values = observations.astype(np.float64)
     values /= np.maximum(values.max(axis=1, keepdims=True), 1e-12)
@@ -136,11 +138,11 @@ def median_turn_deg(
     other_lights: Float64Array,
     other_observations: Floats | None = None,
 ) -> float:
-    """Return the median angle in degrees between the normals that two readings of a capture give.
+    """Return the median angle in degrees between the normals from two readings of a capture.
 
-    It is the error of the first reading if the second is right. Each is a robust fit of
-    observations (P, F) under lights (F, 3) or (P, F, 3); None for the observations of the first
-    reading.
+    If the second reading is right, this is the error of the first. Each is a robust fit of
+    observations (P, F) under lights (F, 3) or (P, F, 3). By default, both have the same
+    observations.
     """
     others = observations if other_observations is None else other_observations
     step = max(1, len(observations) // _TURNED_PIXELS)
@@ -171,8 +173,8 @@ def smooth_normals(vectors: Floats, mask: Bools) -> RoughNormals:
 
 
 def outward_directions(mask: Bools, sigma: float) -> Float64Array:
-    """Return unit vectors (h, w, 2), x right and y up, in which a mask smoothed by `sigma` pixels
-    falls; else zero.
+    """Return unit vectors (h, w, 2), x right and y up, out of a mask smoothed by `sigma` pixels; or
+    zero.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -180,7 +182,7 @@ def outward_directions(mask: Bools, sigma: float) -> Float64Array:
 
 
 def _derivatives(values: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Return the derivatives to the right and upwards; zero along a side of one pixel."""
+    """Return the derivatives to the right and upwards, which are zero along a side of one pixel."""
     downwards, right = (
         np.gradient(values, axis=axis) if values.shape[axis] > 1 else np.zeros_like(values)
         for axis in (0, 1)
@@ -189,33 +191,31 @@ def _derivatives(values: Float64Array) -> tuple[Float64Array, Float64Array]:
 
 
 MISSING, MISSING_OF_OTHER = 0.02, 0.1
-"""Lights are doubted if more than the first share of the lit observations should be in cast shadow
-but are not, and the other reading has less than the second number times this share."""
+"""Lights are doubtful if more than the first share of the lit observations should be in cast shadow
+but are not, and if this share is smaller by the second factor in the other reading."""
 
 
 _MAX_PIXELS = 6000
-# of a pixel's brightest shading, and of its own, beyond which shadows are judged
-_LIT_SHARE, _DARK_SHARE = (
-    0.25,
-    0.4,
-)
-_MARGIN = 0.5  # pixels that a surface must rise above a ray
+# Shadows are judged where the shading exceeds the first share of the pixel's brightest one. A pixel
+# is dark below the second share of its shading.
+_LIT_SHARE, _DARK_SHARE = 0.25, 0.4
+_MARGIN = 0.5  # smallest height of a surface above a ray that it blocks, in pixels
 
 
 @dataclass(frozen=True, eq=False)
 class Shadows:
-    """How well cast shadows of a surface agree with dark observations that should be lit."""
+    """How well the cast shadows of a surface agree with dark observations that should be lit."""
 
     agreement: float  # correlation, from -1 to 1; 0 if too few are dark
     missing: float  # share of the lit observations that should be in cast shadow, but are bright
 
     def evidence(self, other: Shadows) -> float:
-        """Return the evidence for another reading against this one, as an advantage of
+        """Return the evidence for another reading against this one, as an advantage in
         light_check.py.
         """
-        # Weight of a difference of agreements, relative to the weights in light_check.py. Synthetic
-        # bumps agree by 0.2 to 0.9 with correct lights, below 0.02 with negated ones; photographs
-        # of statues by 0.07 to 0.3, and below 0.01.
+        # The factor is relative to the weights in light_check.py. The agreement of synthetic bumps
+        # is 0.2 to 0.9 under correct lights and below 0.02 under negated ones; for photographs of
+        # statues, it is 0.07 to 0.3 and below 0.01.
         found = 5.0 * (other.agreement - self.agreement)
         if self.missing > MISSING and other.missing < MISSING_OF_OTHER * self.missing:
             return found + 1
@@ -224,37 +224,36 @@ class Shadows:
         return found
 
     def leaves_open(self, other: Shadows) -> bool:
-        """Return whether this reading predicts shadows that are missing, more than another one
+        """Return whether this reading predicts more shadows that are missing than another one
         does.
         """
-        # The same shares, from which lights may be wrong. If both readings lack about as many
-        # shadows, the images were rendered without cast shadows, which is not evidence against the
-        # lights.
+        # If both readings lack a similar number of shadows, the images were rendered without cast
+        # shadows, which is not evidence against the lights.
         return self.missing > 0.01 and other.missing < 0.75 * self.missing
 
 
 @dataclass(frozen=True, eq=False)
 class ShadowCheck:
-    """Dark observations of a sample, to be compared with the shadows of its surfaces under its
+    """Dark observations of a sample, for comparison with the shadows of its surface under its
     lights.
     """
 
     normals: RoughNormals  # on a coarser grid
     lights: Float64Array  # (f, 3)
     lit: Bools  # (p, f), whether a matte pixel would be bright
-    dark: Bools  # (p, f), whether it is dark nevertheless
+    dark: Bools  # (p, f), whether the pixel is dark although it should be lit
 
     @classmethod
     def of(cls, observations: Floats, lights: Float64Array, normals: RoughNormals) -> ShadowCheck:
-        """Return the check of observations (P, F) under lights (F, 3), with the smoothed normals
-        that these give.
+        """Return the check of observations (P, F) under lights (F, 3), with smoothed normals from
+        these.
         """
         step = max(1, int(np.ceil(np.sqrt(len(observations) / _MAX_PIXELS))))
         part = slice(None, None, step), slice(None, None, step)
         rows = np.zeros(normals.mask.shape, np.intp)
         rows[normals.mask] = np.arange(len(observations))
         known = normals.normals[part].any(axis=2, keepdims=True)
-        # pixels amid black ones have no normal
+        # Black pixels have no normal.
         facing = np.where(known, normals.normals[part], (0.0, 0.0, 1.0))
         coarse = RoughNormals(facing, normals.mask[part], normals.outward[part])
         chosen = np.linspace(0, len(lights) - 1, min(len(lights), 24)).astype(int)
@@ -265,8 +264,10 @@ class ShadowCheck:
         return cls(coarse, lights[chosen], lit, lit & (values[:, chosen] < _DARK_SHARE * shading))
 
     def shadows(self, matrix: Float64Array) -> tuple[Shadows, Shadows]:
-        """Return the shadows under the lights after a multiplication with a matrix (3, 3), and with
-        their x and y also negated, which inverts the heights of the surface.
+        """Return the shadows under lights multiplied by a matrix (3, 3), and under the opposite
+        lights.
+
+        For opposite lights, x and y are negated, and the heights of the surface are inverted.
         """
         from splinecli.surface.integration import integrate_normals
 
@@ -281,15 +282,16 @@ class ShadowCheck:
         dark = self.dark[self.lit]
         common = np.count_nonzero(cast & dark)
         agreement = 0.0
-        # Fewer lit observations in shadow are noise and highlights.
+        # Fewer common shadows may be due to noise and highlights.
         if common >= max(20, 0.001 * len(dark)) and not cast.all() and not dark.all():
             agreement = float(np.corrcoef(cast, dark)[0, 1])
         return Shadows(agreement, float((cast & ~dark).mean()))
 
 
 def cast_shadows(heights: Float64Array, lights: Float64Array) -> Bools:
-    """Return where a surface shades itself (h, w, F), from heights (h, w) in pixels, NaN outside
-    the object.
+    """Return where a surface shades itself (h, w, F), for lights (F, 3).
+
+    The heights (h, w) are in pixels, NaN outside the object.
     """
     height, width = heights.shape
     relief = float(np.nanmax(heights) - np.nanmin(heights))
@@ -301,7 +303,7 @@ def cast_shadows(heights: Float64Array, lights: Float64Array) -> Bools:
     cast = np.zeros((height, width, len(lights)), np.bool_)
     for place, (x, y, z) in enumerate(lights):
         level = float(np.hypot(x, y))
-        # A ray that has climbed by the whole relief cannot be blocked any more.
+        # A ray that has risen by the whole relief cannot be blocked any more.
         longest = (
             max(height, width) if z <= 0 else min(max(height, width), int(relief * level / z) + 1)
         )

@@ -1,21 +1,20 @@
-"""Lights from the images of the object alone (uncalibrated photometric stereo), and how to resolve
-the ambiguities.
+"""Lights from the images of the object alone (uncalibrated photometric stereo).
 
 The shading of a matte surface leaves its lights ambiguous, so other evidence has to decide. A bump
-looks like a hollow under lights with x and y negated: shading, attached shadows and highlights are
-equal, and so is the curl of the normals. Cast shadows and the outline differ. In addition, the
-heights of a surface may be scaled if its lights are lowered or raised with them. This generalised
-bas-relief ambiguity keeps all shadows (Belhumeur, Kriegman and Yuille, "The bas-relief ambiguity",
-IJCV 1999), but the albedo then changes with the slope.
+looks like a hollow under lights with x and y negated: shading, attached shadows, highlights and the
+curl of the normals are the same, but cast shadows and the outline differ. In addition, the heights
+of a surface may be scaled if its lights are lowered or raised accordingly. This generalised
+bas-relief ambiguity preserves all shadows (Belhumeur, Kriegman and Yuille, "The bas-relief
+ambiguity", IJCV 1999), so the network has to resolve it.
 
-The outline of the object shows a common rotation of lights and normals; see outline.py.
+The outline of the object reveals a common rotation of lights and normals; see outline.py.
 
-Three witnesses find the lights. The light network guesses each light from shading, shadows and
-outline, and predicts the error of its guess. A matte surface under F lights has images of rank 3
-(Hayakawa, JOSA A 1994), and its normals have no curl: see least_curl.py. Lights near the guess and
-lights of least curl then start a search for those under which the network that estimates normals
-expects the smallest errors: see estimate/light_descent.py. Cast shadows and the outline decide
-between bump and hollow.
+The lights are found in three steps. The light network guesses each light from shading, shadows and
+outline, and predicts the error of its guess. Since a matte surface under F lights has images of
+rank 3 (Hayakawa, JOSA A 1994) and its normals have no curl, least_curl.py finds further candidates.
+Starting from these and from lights near the guess, estimate/light_descent.py searches for lights
+under which the network that estimates normals predicts the smallest errors. Cast shadows and the
+outline decide between bump and hollow.
 """
 
 import math
@@ -46,19 +45,16 @@ from splinecli.lights.rough_normals import cast_shadows, smooth_normals
 from splinecli.maths import Bools, Float32Array, Float64Array
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.pixel_grid import Blocks
-from splinecli.maths.robust import fit_robustly, lit_values, shadow_weights
+from splinecli.maths.robust import fit_robustly, shadow_weights
 from splinecli.surface.integration import integrate_normals
 from splinecli.system.machine import side_by_side
 
 _FITS = 5
-_LEAST_Z = 0.1  # of normals that are integrated
-# logarithms of the factors of the heights of the lights that are tried
-_LOG_HEIGHTS = np.arange(-1.2, 0.05, 0.1)
-_ALBEDO_BINS = 41  # of 0.1, of the logarithm of the albedo
+_LEAST_Z = 0.1  # smallest z of normals that are integrated
 
 
 def bump_log_odds(observations: Float32Array, mask: Bools, light_directions: Float64Array) -> float:
-    """Return the log odds that the lights are right against that their x and y are negated.
+    """Return the log odds of the lights against the same lights with x and y negated.
 
     The observations (P, F) are linear, divided by the light intensities. The mask (H, W) has P true
     pixels, in row-major order, and the directions (F, 3) are unit.
@@ -78,7 +74,8 @@ def bump_log_odds(observations: Float32Array, mask: Bools, light_directions: Flo
     normals[..., 2] = np.where(mask, normals[..., 2].clip(min=_LEAST_Z), 0)
     heights = np.where(mask, integrate_normals(unit(normals), mask), np.nan)
     predicted = scaled @ light_directions.T
-    # Where so much is predicted of a pixel's brightest observation, darkness is a cast shadow.
+    # If a pixel is dark although more than this share of its brightest observation is predicted, it
+    # is in a cast shadow.
     facing = bright & (predicted > 0.15)
     dark = values[facing] < 0.5 * predicted[facing]
     bump, hollow = (
@@ -87,67 +84,29 @@ def bump_log_odds(observations: Float32Array, mask: Bools, light_directions: Flo
         )
         for sign in (1, -1)
     )
-    # Logistic regression on 1,056 rendered captures, on which it errs in 1 % of the decisions, or 3
-    # % without outline.
+    # From a logistic regression on 1,056 rendered captures, of which it misclassifies 1 %, or 3 %
+    # without outline.
     return 11.0 * (bump - hollow) + 8.0 * outline
 
 
 def _correlation(predicted: Bools, seen: Bools) -> float:
-    """Return the correlation of two sets; 0 if one has all or none."""
+    """Return the correlation of two boolean arrays; 0 if one of them is constant."""
     if min(predicted.sum(), (~predicted).sum(), seen.sum(), (~seen).sum()) == 0:
         return 0.0
     return float(np.corrcoef(predicted, seen)[0, 1])
 
 
-def lower_lights(
-    observations: Float32Array, light_directions: Float64Array, error_deg: float
-) -> Float64Array:
-    """Return low lights (F, 3), lowered together towards those under which the albedo has few
-    values; others as given.
-
-    The entropy of the albedo is minimised (Alldrin, Mallick and Kriegman, "Resolving the
-    generalized bas-relief ambiguity by entropy minimization", CVPR 2007). Lights are only lowered,
-    because the network's errors are upwards. The observations (P, F) are linear, divided by the
-    light intensities; `error_deg` is the mean expected error.
-    """
-    # The network finds lower lights too high.
-    if np.degrees(np.arcsin(light_directions[:, 2].clip(-1, 1))).mean() > 55.0:
-        return light_directions
-    chosen, values = lit_values(observations, DARK_SHARE, 2000)
-    lit = values > 0.1 * np.quantile(values, 0.6, axis=1, keepdims=True)
-    scaled, _ = fit_robustly(values, lit.astype(np.float64), light_directions, _FITS)
-    known = (lit.sum(axis=1) > 3) & (unit(scaled)[:, 2] > _LEAST_Z)
-    scaled = (scaled * observations[chosen].max(axis=1)[:, None])[known]
-    if len(scaled) < _ALBEDO_BINS:
-        return light_directions
-    # entropy per square of this logarithm and of the expected error in degrees
-    prior = 49.0 / error_deg**2
-    costs = [_entropy(scaled / (1, 1, np.exp(log))) + prior * log**2 for log in _LOG_HEIGHTS]
-    return np.asarray(unit(light_directions * (1, 1, np.exp(_LOG_HEIGHTS[int(np.argmin(costs))]))))
-
-
-def _entropy(scaled_normals: Float64Array) -> float:
-    """Return the entropy of the logarithms of the lengths of vectors (p, 3), relative to their
-    median.
-    """
-    albedo = np.log(np.linalg.norm(scaled_normals, axis=1))
-    places = np.rint((albedo - np.median(albedo)) / 0.1) + _ALBEDO_BINS // 2
-    counts = np.bincount(places.clip(0, _ALBEDO_BINS - 1).astype(int), minlength=_ALBEDO_BINS)
-    shares = np.convolve(counts / len(albedo), (0.25, 0.5, 0.25))
-    return float(-(shares[shares > 0] * np.log(shares[shares > 0])).sum())
-
-
-# mean expected error of lights; larger ones are refused, as their normals would be useless
+# largest mean expected error of lights, above which the normals would be useless
 LARGEST_ERROR_DEG = 25.0
-_MOST_PIXELS = 4_000_000  # of a larger capture, some rows and columns are left out
+_MOST_PIXELS = 4_000_000  # larger captures are subsampled
 _VIEWS = [(turns, mirrored) for turns in range(4) for mirrored in (False, True)]
-_OTHER_DEG = 4.0  # lights that differ by less lead a search to the same lights
+_OTHER_DEG = 4.0  # searches from lights that differ by less have the same result
 _MOST_STARTS = 3
-# largest probability that bump and hollow were confused; captures with a larger one are refused
+# largest accepted probability that bump and hollow were confused
 _MOST_OPPOSITE = 0.25
 
 Search = Callable[..., BestLights]
-"""See best_lights in estimate/light_descent.py, which uses the network that estimates normals."""
+"""best_lights in estimate/light_descent.py, which uses the network that estimates normals."""
 
 
 def find_lights(
@@ -160,14 +119,14 @@ def find_lights(
     first_image: str = "the first image",
     refuse: bool = True,
 ) -> FoundLights:
-    """Find the lights of the images of one object.
+    """Return the lights of the images of one object.
 
-    The observations (P, F) are linear, 0 or more, and divided by the light intensities if they are
-    known; otherwise, these are estimated as well. The mask (H, W) has P true pixels, in row-major
-    order. `first_light` is the side that the light of the first observations comes from, see
-    azimuth_of; it decides between a bump and a hollow. Without it, shadows and the outline decide.
-    Messages call the first image `first_image`. If the images do not determine the lights, an error
-    is raised, or without `refuse` a guess is returned.
+    The observations (P, F) are linear, non-negative, and divided by the light intensities if these
+    are known; otherwise, the intensities are estimated as well. The mask (H, W) has P true pixels,
+    in row-major order. `first_light` is the side that the light of the first observations comes
+    from (see azimuth_of), which decides between a bump and a hollow. Without it, cast shadows and
+    the outline decide. `first_image` is the name of the first image in messages. If the images do
+    not determine the lights, an error is raised; without `refuse`, a guess is returned instead.
 
     Raises UsageError if the first light is neither a known side nor an azimuth; InputError if the
     images are all alike, do not show one surface, or do not determine the lights.
@@ -212,8 +171,8 @@ def find_lights(
             max(expected_deg, differ_by_deg(directions, guess)),
             guess,
         )
-    # Fitted on 150 other captures: under lights with larger errors, the network that estimates
-    # normals expects larger ones, too, usually 2 degrees.
+    # If the lights have larger errors, the network that estimates normals also predicts larger
+    # errors than the usual 2 degrees. The exponent was fitted on 150 other captures.
     found_deg *= (math.degrees(math.exp(found.expected)) / 2) ** 0.3
     errors_deg = errors_deg * found_deg / expected_deg
     opposite_deg = 2 * np.degrees(np.arccos(directions[:, 2].clip(-1, 1)))
@@ -224,7 +183,7 @@ def find_lights(
         raise InputError(
             f"the images do not determine the lights: their estimated error is {expected:.0f}"
             f" degrees, expected at most {LARGEST_ERROR_DEG:.0f}",
-            hint="Show the whole outline of the object and give its mask, add images with"
+            hint="Photograph the whole outline of the object and pass its mask, add images with"
             " other lights, or measure the lights with 'splinecli calibrate'",
         )
     return FoundLights(
@@ -233,10 +192,10 @@ def find_lights(
 
 
 def _usual_error_deg(expected_deg: float, *, outlined: bool) -> float:
-    """Return the mean error of fitted lights from the error that the network expects.
+    """Return the mean error of fitted lights, from the error predicted by the network.
 
-    It was fitted on 720 rendered captures: the network expects too much of easy objects. The 1.2
-    degrees are for photographs.
+    It was fitted on 720 rendered captures, because the network predicts too large errors for easy
+    objects. The 1.2 degrees are for photographs.
     """
     return math.hypot(0.39 * expected_deg**1.3 if outlined else 0.65 * expected_deg, 1.2)
 
@@ -250,16 +209,16 @@ def _fit(
     *,
     refuse: bool,
 ) -> Lights:
-    """Return the lights near the network's guess that fit the images, the outline and the albedo.
+    """Return the lights near the network's guess that fit the images and the outline.
 
-    Raises InputError if `refuse`, and no lights explain the images.
+    With `refuse`, raises InputError if no lights explain the images.
     """
     directions, intensities = guess
     observations = np.asarray(observations / intensities, np.float32)
     error = 0.0 if intensities_known else INTENSITY_ERROR
     fit = fit_near(observations, directions, errors_deg, intensity_error=error, worth_pixels=6.0)
-    # Largest median residual of a matte surface, as a share of a pixel's brightest observation.
-    # Rendered scenes, including metals, reach at most half of this value.
+    # Largest median residual of one surface, relative to a pixel's brightest observation. Rendered
+    # scenes, including metals, reach at most half of this value.
     if refuse and fit is not None and fit.after > 0.08:
         problem = (
             "the images do not show one surface under different distant lights, so the lights"
@@ -274,12 +233,12 @@ def _fit(
     directions, _ = _bump_or_hollow(observations, mask, directions, expected_deg, guess.directions)
     turn = turn_at_outline(observations, mask, directions)
     if turn is not None and turn.spread < 0.2:  # outlines of larger spread are ignored
-        # A share of the rotation that it shows. The part of a larger one beyond twice the expected
-        # error comes from the mouth of a vessel.
+        # Apply a share of the rotation. If it exceeds twice the expected error, the excess is due
+        # to an outline such as the mouth of a vessel.
         share = 0.35 * min(1, 2.0 * expected_deg / max(turn.angle_deg, 1e-9))
         turned = directions @ turn.share(share).T
         directions = turned if (turned[:, 2] > 0).all() else directions
-    return Lights(lower_lights(observations, directions, expected_deg), intensities)
+    return Lights(directions, intensities)
 
 
 def _bump_or_hollow(
@@ -289,8 +248,11 @@ def _bump_or_hollow(
     expected_deg: float,
     guess: Float64Array,
 ) -> tuple[Float64Array, float]:
-    """Return the directions (F, 3), or those with opposite x and y, whichever shadows, outline and
-    the network's guess make more likely, and the probability that the other ones are right.
+    """Return the directions (F, 3) or the opposite ones, whichever is more likely, and the risk of
+    error.
+
+    Shadows, the outline and the network's guess decide. Opposite directions have x and y negated.
+    The risk is the probability that the other directions are right.
     """
     away, opposite = (
         angle_between_deg(directions * sign, guess).mean() for sign in (1.0, OPPOSITE)
@@ -298,9 +260,9 @@ def _bump_or_hollow(
     if opposite < away:
         directions = directions * OPPOSITE
     log_odds = bump_log_odds(observations, mask, directions)
-    # The network seldom confuses bumps with hollows if it sees the outline: never on 113 rendered
-    # captures with expected errors below 14 degrees, three times in nine above 20. Without outline,
-    # it is wrong as often as right.
+    # If the outline is visible, the network seldom confuses bumps with hollows: never on 113
+    # rendered captures with expected errors below 14 degrees, but on three of nine above 20.
+    # Without an outline, its guess is random.
     if is_outlined(mask):
         log_odds += max(0.7, 7.0 - 0.25 * expected_deg)
     directions = directions * OPPOSITE if log_odds < 0 else directions
@@ -309,31 +271,30 @@ def _bump_or_hollow(
 
 def _open_question(mask: Bools, first_image: str) -> InputError:
     problem = "the images do not show whether the object is a bump or a hollow"
-    whole = "If the images show the whole object, give its mask with --mask FILE. Else say"
+    whole = "If the images show the whole object, pass its mask with --mask FILE. Otherwise, state"
     return InputError(
-        f"{problem}, which looks alike under opposite lights",
-        hint=f"{'Say' if is_outlined(mask) else whole} where the light of {first_image} comes from:"
-        " --first-light left, upper-left, or its azimuth in degrees, counter-clockwise from the"
-        " right",
+        f"{problem}, because both look the same under opposite lights",
+        hint=f"{'State' if is_outlined(mask) else whole} where the light of {first_image} comes"
+        " from: --first-light left, upper-left, or its azimuth in degrees, counter-clockwise from"
+        " the right",
     )
 
 
 def _towards(directions: Float64Array, first_light: str) -> Float64Array:
-    """Return the directions (F, 3), or those with opposite x and y, whichever has the first light
-    on this side.
+    """Return the directions (F, 3) or the opposite ones, whichever has the first light on this
+    side.
 
     Raises InputError if it is not clearly on either side.
     """
     azimuth = math.radians(azimuth_of(first_light))
     towards = float(directions[0, :2] @ (math.cos(azimuth), math.sin(azimuth)))
-    # Smallest share of a direction towards a side from which a light comes: 9 degrees from the
-    # camera axis.
+    # A light must be at least 9 degrees from the camera axis, towards the side.
     if abs(towards) < 0.15:
         problem = (
             f"the first light comes neither clearly from {first_light} nor from the opposite side"
         )
         hint = (
-            "Give its azimuth in degrees, such as --first-light 45, or begin with an image that is"
+            "Pass its azimuth in degrees, such as --first-light 45, or start with an image that is"
             " lit from one side"
         )
         raise InputError(problem, hint=hint)
@@ -341,41 +302,39 @@ def _towards(directions: Float64Array, first_light: str) -> Float64Array:
 
 
 def _check_different(observations: Float32Array) -> None:
-    """Raise InputError if the light does not change between the images."""
+    """Raise InputError if the light is the same in all images."""
     rows = observations[:: max(1, len(observations) // 10_000)].astype(np.float64)
-    # a change of exposure is not a change of the light
+    # A change of exposure is not a change of the light.
     rows = rows / np.maximum(rows.mean(axis=0), 1e-12)
     mean = rows.mean(axis=1, keepdims=True)
-    # Images that differ by less from their mean do not show a moving light.
-    if np.abs(rows - mean).mean() <= 0.01 * mean.mean():  # equal for black images
+    if np.abs(rows - mean).mean() <= 0.01 * mean.mean():  # both are zero for black images
         problem = "all images are alike, so they do not determine the lights"
-        raise InputError(
-            problem, hint="Photograph the object with the lamp at a different place for each image"
-        )
+        raise InputError(problem, hint="Move the lamp to another place for each photograph")
 
 
 def _ask_network(
     observations: Float32Array, mask: Bools
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return the directions (F, 3), their expected errors (F,) in degrees and the intensities (F,).
+    """Return the network's directions (F, 3), their expected errors (F,) in degrees and intensities
+    (F,).
 
-    They are means over the four rotations of the images by 90 degrees and their mirror images.
+    They are averaged over the four rotations of the images by 90 degrees and their mirror images.
     """
     area, image = torch.from_numpy(mask), np.zeros(mask.shape, np.float32)
     small = []
-    for values in observations.T:  # one image at a time: all of them would double the memory
+    for values in observations.T:  # one image at a time, to save memory
         image[mask] = values
         cut, inside = square_images(torch.from_numpy(image)[None], area)
         small.append(cut[0])
     if not inside.any():
         raise InputError(
             "the mask is too thin or too scattered to find the lights",
-            hint="Give a mask of the whole object",
+            hint="Pass a mask of the whole object",
         )
     images = torch.stack(small)
     images = images / images[:, inside > 0].quantile(0.99).clamp(min=1e-9)
     network = light_net()
-    # One thread each, so that the number of threads does not change the rounding.
+    # Each view runs in one thread, so that the number of threads does not affect rounding.
     guesses = [*side_by_side(lambda view: _view(network, images, inside, *view), _VIEWS)]
     directions, sharpness, log_intensities, _ = (
         torch.cat(part).double() for part in zip(*guesses, strict=True)

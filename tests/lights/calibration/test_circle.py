@@ -5,7 +5,7 @@ import pytest
 
 from splinecli.capture import read_image, read_mask
 from splinecli.errors import InputError
-from splinecli.lights.calibration.circle import Circle, circle_from_mask, find_circle
+from splinecli.lights.calibration.circle import Circle, circle_from_mask, find_circles
 
 TRUE = Circle(103.3, 88.7, 61.4)
 
@@ -39,7 +39,7 @@ def test_masks_and_pictures_that_are_no_ball():
         with pytest.raises(InputError, match="expected a ball"):
             circle_from_mask(mask)
     with pytest.raises(InputError, match="found no circle"):
-        find_circle(np.tile(np.linspace(0, 1, 200), (150, 1)))
+        find_circles(np.tile(np.linspace(0, 1, 200), (150, 1)))
 
 
 @pytest.mark.parametrize(("ball", "wall"), [(0.1, 0.9), (0.9, 0.1), (0.01, 0.02)])
@@ -49,7 +49,7 @@ def test_circle_in_a_picture(ball, wall, scale):
     shape = (180 * scale, 210 * scale)
     picture = np.where(true.inside(shape), ball, wall)
     picture += np.random.default_rng(0).normal(0, 0.02 * abs(ball - wall), shape)
-    found = find_circle(picture.clip(0))
+    found = find_circles(picture.clip(0))[0]
     assert_close(found, true, 0.5 * max(1, scale / 3))
     assert found.visible > 0.9
 
@@ -66,7 +66,7 @@ def test_real_balls(shared_data, record_property):
         folder = shared_data / f"psbox/LightProbe-{number}"
         x, y, radius = (float(word) for word in (folder / "circle_data.txt").read_text().split())
         picture = read_image(folder / "ref.JPG").mean(axis=2)
-        found = find_circle(picture)
+        found = find_circles(picture)[0]
         record_property(f"ball {number}", repr(found))
         assert_close(found, Circle(x, len(picture) - y, radius), 0.01 * radius)
     found = circle_from_mask(read_mask(shared_data / "uw/chrome/mask.png"))

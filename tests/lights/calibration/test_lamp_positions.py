@@ -186,10 +186,10 @@ def test_lamps_without_positions(tmp_path, render_ball, known):
     )
     assert (
         calibration_lines(report)[-1]
-        == "the lamps' distances are unknown: they are treated as distant"
+        == "the lamps' distances are unknown, so the lamps are treated as distant"
     )
     expected = (
-        "put the balls farther apart" if known else "If the lamps are near, add --camera-matrix."
+        "move the balls farther apart" if known else "If the lamps are near, add --camera-matrix."
     )
     assert any(expected in warning for warning in report["warnings"])
     assert triangulate_lamps(balls[:1]) is None
@@ -257,9 +257,6 @@ def test_a_compared_file(directions):
     # The normal at the highlight halves the angle of 40 degrees.
     found = report([ball(lights)], turned(directions, 20))
     assert found["compared"] == {"mean_deg": 20.0, "largest_deg": 20.0}
-    assert (
-        "the normals of the ball at the highlights instead of the light directions"
-        in found["warnings"][0]
-    )
+    assert "the normals of the ball at the highlights, which are halfway" in found["warnings"][0]
     # Directions that are wrong in another way are not mistaken for normals.
     assert report([ball(lights)], turned(lights, 20))["warnings"] == []

@@ -1,9 +1,9 @@
-"""Light directions from folders of images of mirror balls.
+"""Light directions from images of mirror balls, in one folder for each ball.
 
-The light direction follows from the highlight of a lamp in a mirror ball. The ball's normal n at
-the highlight halves the angle between the light direction l and the direction v to the camera, so l
-= 2 (n.v) n - v. A common mistake is to use n itself as the light direction. The camera is at the
-origin, and the unit of length is the radius of the ball. x is right, y up, z towards the camera.
+The light direction follows from the highlight of a lamp in the ball. At the highlight, the ball's
+normal n is halfway between the light direction l and the direction v to the camera, so l = 2 (n.v)
+n - v. A common mistake is to use n itself as the light direction. The camera is at the origin, and
+the unit of length is the radius of the ball; x right, y up, z towards the camera.
 """
 
 import math
@@ -40,12 +40,12 @@ from splinecli.maths.pixel_grid import ray_basis
 from splinecli.records.capture_warnings import CaptureWarning
 from splinecli.system.progress import Progress, ignore
 
-# focal length, in pixels, from which a camera is treated as distant: all its rays are nearly
-# parallel
+# focal length in pixels of a distant camera, whose rays are nearly parallel
 DISTANT = 1e6
-# of usual focal lengths, in longer sides of the image: 25 mm for 36 mm of film, as in telephones
+# shortest usual focal length, relative to the longer side of the image: 25 mm for 36 mm of film, as
+# in telephones
 SHORTEST_LENS = 0.7
-# tags of EXIF
+# EXIF tags
 _FOCAL_LENGTH, _WIDTH, _RESOLUTION, _UNIT, _FILM = (0x920A, 0xA002, 0xA20E, 0xA210, 0xA405)
 
 
@@ -55,35 +55,37 @@ class View:
 
     matrix: Float64Array  # (3, 3) in pixels
     source: str  # "--camera-matrix", "EXIF" or "assumed distant"
-    shortest: float  # the focal length of the shortest usual lens, in pixels
+    shortest: float  # the shortest usual focal length, in pixels
 
     @property
     def known(self) -> bool:
         return self.source != "assumed distant"
 
     def draw(self, generator: np.random.Generator) -> Float64Array:
-        """Draw a matrix (3, 3) at random from those that may be the true one."""
+        """Return a random camera matrix (3, 3) that is compatible with the known facts."""
         matrix = self.matrix.copy()
         if not self.known:
-            # All rays of sight from parallel ones to the shortest lens, evenly.
+            # Uniform between parallel rays and the shortest usual lens.
             nearest = self.shortest / float(matrix[0, 0])
             matrix[:2, :2] *= nearest / generator.uniform(nearest, 1)
         elif self.source == "EXIF":
-            # Focal lengths in EXIF have this standard deviation: numbers are rounded, and focusing
-            # changes them.
+            # Focal lengths in EXIF have this standard deviation, because they are rounded and
+            # focusing changes them.
             matrix[:2, :2] *= math.exp(0.05 * generator.normal())
         return matrix
 
 
 def unit_rays(points: Float64Array, matrix: Float64Array) -> Float64Array:
-    """Return the unit vectors (N, 3) from a camera at the origin through image points (N, 2)."""
+    """Return unit vectors (N, 3) from a camera at the origin through image points (N, 2)."""
     return unit(np.column_stack((points, np.ones(len(points)))) @ ray_basis(matrix))
 
 
 def find_view(image: ImageHeader, matrix: Path | None) -> View:
-    """Return the camera that a matrix file or an image's EXIF tags describe, else a distant one.
+    """Return the camera described by a matrix file or an image's EXIF tags, or else a distant
+    camera.
 
-    Raises InputError if the file or the image cannot be read, or the file has no camera matrix.
+    Raises InputError if the file or the image cannot be read, or if the file does not contain a
+    camera matrix.
     """
     height, width = image.size[0][:2]
     shortest = SHORTEST_LENS * max(width, height)
@@ -96,13 +98,13 @@ def find_view(image: ImageHeader, matrix: Path | None) -> View:
 
 
 def _focal_length(tags: Mapping[int, Any], width: int, height: int) -> float | None:
-    """Return the focal length in pixels from EXIF tags; None if they do not contain it."""
-    millimetres = {2: 25.4, 3: 10.0}  # of an inch and of a centimetre, by EXIF's numbers of units
+    """Return the focal length in pixels from EXIF tags; None if it is missing."""
+    millimetres = {2: 25.4, 3: 10.0}  # in an inch and a centimetre, by EXIF's codes of units
     try:
         if tags.get(_RESOLUTION) and tags.get(_FOCAL_LENGTH) and tags.get(_UNIT, 2) in millimetres:
             pixels = float(tags[_FOCAL_LENGTH]) * float(tags[_RESOLUTION])
             pixels /= millimetres[tags.get(_UNIT, 2)]
-            pixels *= width / float(tags.get(_WIDTH) or width)  # the picture may be scaled
+            pixels *= width / float(tags.get(_WIDTH) or width)  # in case the picture was scaled
         else:
             pixels = float(tags[_FILM]) / math.hypot(36, 24) * math.hypot(width, height)
     except Exception:  # damaged tags cause a dozen types of errors
@@ -110,7 +112,7 @@ def _focal_length(tags: Mapping[int, Any], width: int, height: int) -> float | N
     return pixels if SHORTEST_LENS / 3 * width < pixels < DISTANT else None
 
 
-# a highlight is the patch above this share of its brightest value, after a slight blur
+# A highlight is the patch above this share of its brightest value, after a slight blur.
 _HIGHLIGHT_LEVEL = 0.7
 
 
@@ -118,15 +120,16 @@ _HIGHLIGHT_LEVEL = 0.7
 class Highlight:
     """The image of a lamp in a mirror ball."""
 
-    x: float  # of the centroid, in pixels of the image
+    x: float  # position of the centroid, in pixels of the image
     y: float
-    saturated: float  # share of its pixels that is saturated, 0 to 1
+    saturated: float  # share of saturated pixels, 0 to 1
 
 
 def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = None) -> Highlight:
-    """Return the highlight of the lamp in the ball: the weighted centroid of its brightest patch.
+    """Return the highlight of the lamp in the ball, located at the centroid of its brightest patch.
 
-    Raises InputError if the ball shows no highlight, or its brightest patch is too wide for a lamp.
+    Raises InputError if the ball shows no highlight, or if its brightest patch is too wide for a
+    lamp.
 
     Args:
         image: (H, W), linear gray values.
@@ -134,22 +137,17 @@ def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = N
     """
     inside = circle.inside(image.shape)
     values = np.where(inside, image, 0).astype(np.float32)
-    # The blur removes bright single pixels, which are dust or noise.
+    # The blur removes single bright pixels, which are dust or noise.
     smooth = cv2.GaussianBlur(values, (0, 0), max(0.8, circle.radius / 200)) * inside
     brightest, median = float(smooth.max()), float(np.median(values[inside]))
-    # smallest ratio of the highlight to the median of the ball
     if brightest <= 4.0 * median or brightest <= 0:
-        hint = (
-            "Is this a folder of images of a mirror ball? If so, take the images with all other"
-            " lights off: the lamp"
-        )
         raise InputError(
             "found no highlight in the ball",
-            hint=f"{hint} must be by far the brightest spot in the ball",
+            hint="If these are images of a mirror ball, take them with all other lights off, so"
+            " that the lamp is by far the brightest spot in the ball",
         )
     _, labels = cv2.connectedComponents((smooth >= _HIGHLIGHT_LEVEL * brightest).astype(np.uint8))
-    # Of several patches, take the one with the most light rather than the one with the brightest
-    # pixel.
+    # Of several patches, choose the one with the most light rather than the brightest pixel.
     light = np.bincount(labels.ravel(), weights=smooth.ravel())
     light[0] = 0
     core = labels == light.argmax()
@@ -160,8 +158,7 @@ def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = N
             f"the brightest patch in the ball is {width} pixels wide, too wide for a lamp",
             hint="Shorten the exposure, or cover windows and bright walls",
         )
-    # In a saturated highlight all weights are nearly equal, so the centroid is the middle of its
-    # shape.
+    # In a saturated highlight, all weights are nearly equal, so this is the centroid of its shape.
     weight = smooth[core].astype(np.float64) - 0.9 * _HIGHLIGHT_LEVEL * brightest
     saturated = float((values[core] >= full_scale).mean()) if full_scale is not None else 0.0
     x_centre, y_centre = (float(np.average(axis, weights=weight)) for axis in (x, y))
@@ -172,7 +169,7 @@ def ball_centre(outline: Float64Array, matrix: Float64Array) -> Float64Array:
     """Return the centre (3,) of a ball whose outline is at these image points (N, 2) of a camera.
 
     Rays d that touch the ball, |d| = 1, form a cone: d.c = sqrt(|c|^2 - 1). For m = c / sqrt(|c|^2
-    - 1), this is linear. Written with m_z + 1, it is also exact for a camera that is far away.
+    - 1), this is linear. Written in terms of m_z + 1, it is also exact for a distant camera.
     """
     x, y, _ = (np.column_stack((outline, np.ones(len(outline)))) @ ray_basis(matrix)).T
     equations = np.column_stack((x, y, np.ones(len(x))))
@@ -190,9 +187,8 @@ def ball_centre(outline: Float64Array, matrix: Float64Array) -> Float64Array:
 def reflect(
     centre: Float64Array, highlights: Float64Array, matrix: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball.
-
-    They are NaN outside the ball.
+    """Return normals and light directions (F, 3) at the highlights (F, 2) of a ball, NaN outside
+    the ball.
     """
     rays = unit_rays(highlights, matrix)
     across = centre - (rays @ centre)[:, None] * rays
@@ -202,7 +198,7 @@ def reflect(
 
 
 REFERENCES = ("ref", "reference")
-"""Names, without suffix, of an image that shows the outline of the ball and belongs to no light."""
+"""Names, without suffix, of an additional image that shows the outline of the ball."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +209,7 @@ class BallFiles:
     images: tuple[Path, ...]  # one image for each light, in the order of the lights
     reference: Path | None  # an image that shows the outline of the ball, or None
     mask: Path | None
-    warnings: tuple[CaptureWarning, ...] = ()  # the choice of the mask
+    warnings: tuple[CaptureWarning, ...] = ()  # report how the mask was chosen
 
     @cached_property
     def facts(self) -> tuple[ImageHeader, ...]:
@@ -230,11 +226,11 @@ class BallCalibration:
     circle_from: str  # the source of the outline: "--circle", "mask" or "picture"
     highlights: tuple[Highlight, ...]  # (F,), one for each image
     directions: Float64Array  # (F, 3) float64, unit vectors; x right, y up, z to the camera
-    # (F, 3), of the ball at the highlights, half-way between the view and the lights
+    # (F, 3), normals of the ball at the highlights, halfway between the view and the lights
     normals: Float64Array
     view: View
     shape: tuple[int, ...]  # (H, W) of the images
-    doubt: str | None = None  # why the outline may be that of something else than a mirror ball
+    doubt: str | None = None  # why the outline may not belong to a mirror ball
 
     @property
     def points(self) -> Float64Array:
@@ -244,10 +240,10 @@ class BallCalibration:
 
 @dataclass(frozen=True, eq=False)
 class CalibratedLights:
-    """The light directions from one or several balls."""
+    """The light directions from one or more balls."""
 
     balls: tuple[BallCalibration, ...]
-    directions: Float64Array  # (F, 3) float64, unit vectors: the mean direction of the balls
+    directions: Float64Array  # (F, 3) float64, unit vectors, the mean over the balls
     # (F,), largest angle between a ball's direction and the mean; 0 for one ball
     disagreement_deg: Float64Array
 
@@ -255,8 +251,8 @@ class CalibratedLights:
 def find_ball_files(folder: Path, mask: Path | None = None) -> BallFiles:
     """Return the files of the ball in a folder.
 
-    The images are in natural order or in the order of filenames.txt. A mask that is given replaces
-    the one in the folder. Raises InputError if the folder has no images.
+    The images are in natural order or in the order of filenames.txt. If `mask` is given, it is used
+    instead of the one in the folder. Raises InputError if the folder contains no images.
     """
     not_lights, leave_out = (
         capture_files.NOT_PHOTOGRAPHS | set(REFERENCES),
@@ -278,14 +274,15 @@ def calibrate_ball(
     camera_matrix: Path | None = None,
     progress: Progress = ignore,
 ) -> BallCalibration:
-    """Find the outline, the highlights and the light directions of one ball.
+    """Return the outline, the highlights and the light directions of one ball.
 
     Only one image is in memory at a time.
 
     Args:
-        circle: the outline. None takes it from the mask, from the reference image, or from the mean
+        circle: the outline. By default, it is taken from the mask, the reference image, or the mean
             of all images, in this order.
-        camera_matrix: a file; None takes the camera from EXIF, or as distant (see find_view).
+        camera_matrix: a file. By default, the camera is taken from EXIF or assumed to be distant
+            (see find_view).
 
     Raises:
         InputError: an image cannot be read, has another size or shows no highlight; or the outline
@@ -301,7 +298,7 @@ def calibrate_ball(
         stored = decode_image(path, ExpectedSize(shape, files.images[0].name))
         if not circle.inside(shape).any():
             raise InputError(
-                "the circle is outside the image", path=path, hint="--circle is X,Y,R in pixels"
+                "the circle is outside the image", path=path, hint="Give --circle X,Y,R in pixels"
             )
         try:
             full_scale = 1.0 if stored.dtype.kind == "u" else None
@@ -312,7 +309,7 @@ def calibrate_ball(
             normal, direction = reflect(centre, point, view.matrix)
             if not direction[0] @ unit_rays(point, view.matrix)[0] < 0:
                 raise InputError(
-                    "the highlight is near the rim of the ball: the lamp is level with the ball"
+                    "the highlight is near the rim of the ball, so the lamp is level with the ball"
                     " or behind it",
                     hint="Place all lights on the camera's side of the object",
                 )
@@ -330,14 +327,16 @@ def calibrate_ball(
 
 
 _LEAST_VISIBLE = 0.6  # share of the outline of a ball that is found in a picture
-_SMALLER = 0.8  # of the radius, at most: another circle that may be the ball
-_CLEAR = 0.7  # share of the outline from which a smaller circle may be the ball
-_LEAST_MOTION = 0.02  # of the radius, between the highlights of most images and their median
+_SMALLER = 0.8  # largest radius of another circle that may be the ball, relative to the first
+_CLEAR = 0.7  # smallest visible share of the outline of such a circle
+_LEAST_MOTION = 0.02  # median distance of highlights from their median, relative to the radius
 
 
 def _doubt(circles: Sequence[Circle], highlights: Float64Array, n_agreeing: int) -> str | None:
-    """Return why the first of the circles in a picture may not be the edge of a mirror ball with
-    these highlights (F, 2); None for no doubt.
+    """Return a reason why the first circle may not be the outline of a mirror ball; None without
+    one.
+
+    The circles were found in a picture, and the highlights are (F, 2).
     """
     ball, n_images = circles[0], len(highlights)
     if ball.visible < _LEAST_VISIBLE:
@@ -348,25 +347,24 @@ def _doubt(circles: Sequence[Circle], highlights: Float64Array, n_agreeing: int)
         around = np.hypot(*(highlights - (other.x, other.y)).T).max() < other.radius
         if around and other.radius < _SMALLER * ball.radius and other.visible > _CLEAR:
             return (
-                f"a smaller one (centre {other.x:.0f}, {other.y:.0f}, radius"
-                f" {other.radius:.0f} pixels) is clear, too, and contains all highlights"
+                f"a smaller circle (centre {other.x:.0f}, {other.y:.0f}, radius"
+                f" {other.radius:.0f} pixels) is also clear and contains all highlights"
             )
     moved = np.hypot(*(highlights - np.median(highlights, axis=0)).T)
     if n_images > 2 and np.median(moved) < _LEAST_MOTION * ball.radius:
-        return "the highlight stays in its place in most images"
+        return "the highlight does not move in most images"
     return None
 
 
 def combine_balls(balls: Sequence[BallCalibration]) -> CalibratedLights:
-    """Return the mean direction of each light over the balls.
-
-    Raises InputError for unequal numbers of images.
+    """Return the mean light directions over the balls. Raises InputError for unequal numbers of
+    images.
     """
     if len({len(ball.directions) for ball in balls}) > 1:
         counts = ", ".join(f"{len(ball.directions)} images ({ball.files.folder})" for ball in balls)
         raise InputError(
             f"the balls have {counts}",
-            hint="Every ball needs one image for each light, in the same order",
+            hint="Take one image of every ball for each light, in the same order",
         )
     stacked = np.stack([ball.directions for ball in balls])
     directions = unit(stacked.sum(axis=0))
@@ -375,8 +373,9 @@ def combine_balls(balls: Sequence[BallCalibration]) -> CalibratedLights:
 
 
 def _find_outline(files: BallFiles) -> tuple[list[Circle], str]:
-    """Return the circles that may be the outline of the ball, the likeliest first, and their
-    source: "mask" or "picture".
+    """Return the circles that may be the outline of the ball, most likely first, and their source.
+
+    The source is "mask" or "picture".
     """
     path = files.mask or files.reference or files.images[0]
     try:
@@ -401,7 +400,7 @@ def _find_outline(files: BallFiles) -> tuple[list[Circle], str]:
         raise InputError(
             f"{ball} is not entirely inside the image",
             path=path,
-            hint="Take images of the whole ball; if this is not the ball, give its circle with"
+            hint="Take images of the whole ball; if this is not the ball, pass its circle with"
             " --circle X,Y,R",
         )
     return circles, source

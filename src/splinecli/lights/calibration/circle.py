@@ -1,7 +1,7 @@
-"""The outline of a ball: a circle from a mask or from an image, with measures of its quality.
+"""The outline of a ball: a circle from a mask or an image, with measures of its quality.
 
-Coordinates are in pixels of the image: x right, y down, whole numbers at pixel centres, (0, 0) the
-top left pixel.
+Coordinates are in pixels of the image: x right, y down, with integers at pixel centres and (0, 0)
+at the top left pixel.
 """
 
 import math
@@ -18,30 +18,28 @@ _ANGLES = np.arange(720) * (2 * np.pi / 720)
 _RAYS = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))  # unit vectors
 # Smallest visible share of an outline. A shorter arc may be the edge of another object.
 _MIN_VISIBLE = 0.35
-# of the radius: the distance to either side of the guess in which edges are searched
-_SEARCH_BAND = 0.06
-# of the radius: the largest distance from the circle at which a point agrees with it
-_TOLERANCE = 0.015
-_SAME = 0.03  # of the radius: the largest difference of equal circles in two images
+# Relative to the radius:
+_SEARCH_BAND = 0.06  # distance to either side of the guess within which edges are searched
+_TOLERANCE = 0.015  # largest distance of a point from a circle with which it agrees
+_SAME = 0.03  # largest difference between equal circles in two images
 
 
 @dataclass(frozen=True)
 class Circle:
     """The outline of a ball."""
 
-    x: float  # x, y, radius: in pixels. The defaults below apply to a circle that the user gives
+    x: float  # x, y and radius are in pixels. The defaults apply to a circle given by the user
     y: float
     radius: float
     spread: float = 0.0  # rms distance of the outline's points from the circle, in pixels
-    visible: float = 1.0  # share of the outline that the image or mask shows, 0 to 1
-    # (N, 2), of the outline
+    visible: float = 1.0  # share of the outline that is visible in the image or mask, 0 to 1
+    # (N, 2), points of the outline
     points: Float64Array | None = field(default=None, repr=False, compare=False)
 
     @property
     def outline(self) -> Float64Array:
-        """The points (N, 2) of the outline near the circle.
-
-        A near camera shows an ellipse instead of a circle.
+        """The points (N, 2) of the outline near the circle. With a near camera, it is an
+        ellipse.
         """
         if self.points is not None:
             return self.points[
@@ -50,9 +48,9 @@ class Circle:
         return (self.x, self.y) + self.radius * _RAYS
 
     def normals(self, x: Float64Array, y: Float64Array) -> Float64Array:
-        """Return the unit normals (N, 3) of the ball at image points, NaN outside the circle.
+        """Return the unit normals (N, 3) of the ball at image points in an orthographic view.
 
-        The view is orthographic.
+        They are NaN outside the circle.
         """
         nx, ny = (x - self.x) / self.radius, (self.y - y) / self.radius
         with np.errstate(invalid="ignore"):
@@ -64,7 +62,7 @@ class Circle:
         return np.asarray((x - self.x) ** 2 + (y - self.y) ** 2 < self.radius**2)
 
     def reaches_beyond(self, shape: tuple[int, ...]) -> bool:
-        """Return whether a hundredth of the radius or more is outside the image."""
+        """Return whether at least a hundredth of the radius is outside the image."""
         reach = 0.99 * self.radius
         places = ((self.x, shape[1]), (self.y, shape[0]))
         return any(middle - reach < -0.5 or middle + reach > size - 0.5 for middle, size in places)
@@ -73,44 +71,37 @@ class Circle:
 def circle_from_mask(mask: Bools) -> Circle:
     """Return the circle through most of the outline of the largest part of a mask (H, W).
 
-    Raises InputError if the outline does not belong to a ball.
+    Raises InputError if the outline is not a circle.
     """
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     outline = max(contours, key=cv2.contourArea)[:, 0].astype(np.float64)
     height, width = mask.shape
     x, y = outline.T
-    # Points on the frame of the image are not part of the outline.
+    # Points at the border of the image are not part of the outline.
     outline = outline[(x > 0) & (y > 0) & (x < width - 1) & (y < height - 1)]
     if len(outline) < 12:
         raise InputError("the mask has no outline inside the image, expected a ball")
     circle = _fit(outline, outline_points=len(outline))
-    # The contour runs through the centres of the outermost pixels. The ball reaches half a pixel
-    # further.
+    # The contour passes through the centres of the outermost pixels, so the ball extends half a
+    # pixel further.
     outline = outline + 0.5 * unit(outline - (circle.x, circle.y))
     circle = replace(circle, radius=circle.radius + 0.5, points=outline)
     if circle.visible < _MIN_VISIBLE:
         raise InputError(
             f"only {100 * circle.visible:.0f} % of the mask's outline is on a circle, expected a"
             " ball",
-            hint="Mark only the ball in the mask, or give its circle with --circle X,Y,R",
+            hint="Mark only the ball in the mask, or pass its circle with --circle X,Y,R",
         )
     return circle
 
 
-def find_circle(image: Array) -> Circle:
-    """Return the clearest circle in a gray image (H, W), such as a ball on another background.
-
-    Raises InputError if no clear circle is found.
-    """
-    return find_circles(image)[0]
-
-
 def find_circles(image: Array) -> list[Circle]:
-    """Return the clear circles in a gray image (H, W), the likeliest ball first. Raises InputError
-    if there are none.
+    """Return the clear circles in a gray image (H, W), the most likely ball first.
+
+    Raises InputError if there are none.
     """
     values = _brightened(image)
-    scale = 480 / max(values.shape)  # the Hough transform searches an image of this longer side
+    scale = 480 / max(values.shape)  # longer side of the image for the Hough transform
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     small = cv2.resize(values, None, fx=scale, fy=scale, interpolation=interpolation)
     small = cv2.GaussianBlur(small, (0, 0), 1.5)
@@ -126,26 +117,24 @@ def find_circles(image: Array) -> list[Circle]:
             minRadius=round(0.08 * max(small.shape)),
             maxRadius=round(0.55 * max(small.shape)),
         )
-        # The best circles of the Hough transform are refined.
         for x, y, radius in found[0, :12].tolist() if found is not None else ():
-            # Pixel centres are at whole numbers in both images, so their corners differ by half a
-            # pixel.
+            # Pixel centres are at integers in both images, so corners are offset by half a pixel.
             guess = Circle((x + 0.5) / scale - 0.5, (y + 0.5) / scale - 0.5, radius / scale)
             refined.append(_refine(values, guess))
     circles = [circle for circle in refined if circle is not None]
     if not circles:
         hint = (
-            "Is this a folder of images of a mirror ball? If so, give a mask of the ball with"
-            " --mask, or its circle"
+            "If these are images of a mirror ball, pass a mask of the ball with --mask, or its"
+            " circle with --circle X,Y,R"
         )
-        raise InputError("found no circle, expected a ball", hint=f"{hint} with --circle X,Y,R")
-    # Reflections in the ball are circles, too. Of two equally visible circles, the larger one is
+        raise InputError("found no circle, expected a ball", hint=hint)
+    # Reflections in the ball may also be circles. Of two equally visible circles, the larger one is
     # the ball.
     return sorted(circles, key=lambda each: -each.visible * math.sqrt(each.radius))
 
 
 def is_in(image: Array, circle: Circle) -> bool:
-    """Return whether the edges in a gray image (H, W) confirm a circle."""
+    """Return whether a circle agrees with the edges in a gray image (H, W)."""
     found = _refine(_brightened(image), circle)
     if found is None:
         return False
@@ -155,15 +144,15 @@ def is_in(image: Array, circle: Circle) -> bool:
 
 def _brightened(image: Array) -> Float32Array:
     values = image.astype(np.float32)
-    # Many images show a dark ball in front of a dark background. Clipping the brightest 1 % brings
-    # out its edge.
+    # In many images, a dark ball is in front of a dark background. Clipping the brightest 1 %
+    # emphasises its edge.
     return np.asarray(np.sqrt(values / max(float(np.quantile(values, 0.99)), 1e-9)).clip(0, 1))
 
 
 def _refine(values: Float32Array, guess: Circle) -> Circle | None:
     """Return the circle through the strongest edges along rays from the centre of a guess.
 
-    Return None if too few agree.
+    None if too few edges agree.
     """
     for band in (_SEARCH_BAND, _SEARCH_BAND / 2):
         half = max(band * guess.radius, 3.0)
@@ -178,7 +167,7 @@ def _refine(values: Float32Array, guess: Circle) -> Circle | None:
         edge[~np.isfinite(edge)] = 0
         peak = edge[:, 1:-1].argmax(axis=1) + 1
         before, strength, after = (edge[np.arange(len(_RAYS)), peak + step] for step in (-1, 0, 1))
-        # Sub-pixel position: the top of the parabola through the peak and its neighbours.
+        # Sub-pixel position: the maximum of the parabola through the peak and its neighbours.
         bend = np.maximum(2 * strength - before - after, 1e-12)
         reach = steps[1] + 0.5 * (peak + ((after - before) / (2 * bend)).clip(-0.5, 0.5))
         clear = strength > 0.01  # weakest edge that is used
@@ -194,8 +183,8 @@ def _refine(values: Float32Array, guess: Circle) -> Circle | None:
 def _fit(points: Float64Array, *, outline_points: int) -> Circle:
     """Return the circle through most of the points (N, 2).
 
-    A complete outline would have `outline_points`. RANSAC with samples of three points, then least
-    squares over the points close to the circle.
+    RANSAC with samples of three points is followed by least squares over the points close to the
+    circle. A complete outline would have `outline_points`.
     """
     generator, size = np.random.default_rng(0), np.ptp(points, axis=0).max()
     best: tuple[float, float, float] | None = None
@@ -221,8 +210,8 @@ def _fit(points: Float64Array, *, outline_points: int) -> Circle:
         close_by = points[_distance(points, best) < _TOLERANCE * best[2]]
         if len(close_by) < 3:
             break
-        # x^2 + y^2 = 2 a x + 2 b y + c is linear in the centre (a, b). Centring the points keeps it
-        # accurate.
+        # x^2 + y^2 = 2 a x + 2 b y + c is linear in the centre (a, b). The points are centred for
+        # accuracy.
         middle = close_by.mean(axis=0)
         around = close_by - middle
         terms = np.column_stack((2 * around, np.ones(len(around))))

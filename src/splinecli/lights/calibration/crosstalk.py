@@ -1,6 +1,5 @@
-"""Crosstalk of three coloured lamps that light a matte gray ball at once.
-
-It is the share of each lamp in each channel.
+"""Crosstalk of three coloured lamps that light a matte gray ball at once: the share of each lamp in
+each channel.
 """
 
 from __future__ import annotations
@@ -25,27 +24,25 @@ def measure_crosstalk(
     *,
     radiometry: RadiometricCalibration = AS_STORED,
 ) -> Float64Array:
-    """Return crosstalk matrices (N, 3, 3) from N colour images of a matte gray ball.
+    """Return crosstalk matrices (N, 3, 3) with a mean diagonal of 1, from colour images of a gray
+    ball.
 
-    Their mean diagonal is 1. Least absolute deviations of I_c = sum over l of M[c, l] max(n . l_l,
-    0), over the pixels that are not saturated.
+    For N images, the absolute deviations of I_c = sum over l of M[c, l] max(n . l_l, 0) are
+    minimised over the pixels that are not saturated.
 
     Args:
-        files: colour images of the ball under all three lamps, and its mask.
+        files: colour images of the matte ball under all three lamps, and its mask.
         light_directions: (3 N, 3), unit, three for each image in the order R, G, B.
 
     Raises:
-        InputError: the numbers of images and lights differ, an image cannot be read, is gray or
-            saturated, or the channels do not separate the lamps.
+        InputError: the numbers of images and lights do not match, an image cannot be read, is gray
+            or saturated, or the channels do not separate the lamps.
     """
     count = len(files.images)
     if CHANNELS * count != len(light_directions):
-        problem = (
-            f"found {count} colour images of the gray ball and {len(light_directions)} lights,"
-            " expected three"
-        )
         raise InputError(
-            f"{problem} lights for each image",
+            f"found {count} colour images of the gray ball and {len(light_directions)} lights,"
+            " expected three lights for each image",
             path=files.folder,
             hint="For each colour image, photograph the mirror ball under each lamp alone, in the"
             " order R, G, B",

@@ -1,9 +1,8 @@
 """Intensities of lamps, positions of near lamps, and the report of a calibration.
 
-Near lamps are located by triangulation from two or more mirror balls. Each ball gives a ray: from
-the highlight on its surface in the direction of the lamp. The balls' centres, which follow from the
-size of their outlines, are near a plane z = const, and the object's mean plane should be that
-plane.
+Near lamps are located by triangulation from two or more mirror balls. Each ball provides a ray from
+the highlight on its surface towards the lamp. The centres of the balls, which follow from the size
+of their outlines, are near a plane z = const, which should be the object's mean plane.
 """
 
 import math
@@ -46,10 +45,10 @@ def measure_light_intensities(
 ) -> Float64Array:
     """Return light intensities (F, 3), RGB, with mean 1, from images of a gray target.
 
-    By Lambert's law, each is the median of I / (n.l) over the pixels of the target. The images are
-    read and saturated pixels are found as in a capture. Raises InputError if the numbers of images
-    and lights differ, an image cannot be read or has another size, or the target is dark or
-    saturated under a light.
+    According to Lambert's law, each is the median of I / (n.l) over the pixels of the target.
+    Images are read and saturated pixels are found as in a capture. Raises InputError if the numbers
+    of images and lights differ, an image cannot be read or has another size, or the target is dark
+    or saturated under a light.
 
     Args:
         files: one image of the target for each light, and a mask of the target. A card without a
@@ -70,15 +69,15 @@ def measure_light_intensities(
         values.append(image.linear.astype(np.float64))
     saturated = Saturation(len(normals), tuple(found), rows=rows, even=True).flags
     cosines = normals[rows] @ light_directions.T
-    # n.l of the pixels that are used: closer to grazing light, a matte ball is seldom Lambertian
+    # smallest n.l of the pixels that are used, because a matte ball is not Lambertian at grazing
+    # angles
     smallest = 0.35
     intensities = np.empty((n_lights, 3))
     for position, path in enumerate(files.images):
         ratios = values[position] / np.maximum(cosines[:, position], smallest)[:, None]
         if saturated is not None:
-            # A card is alike everywhere: saturated pixels are its brightest, and do not shift the
-            # median. On a ball, they are where n.l is largest, and the other pixels give the same
-            # intensity without them.
+            # The saturated pixels of a uniform card are its brightest, which does not affect the
+            # median. On a ball, they are where n.l is largest, so the other pixels suffice.
             ratios[saturated[:, position]] = np.inf if target == "card" else np.nan
         ratios = ratios[(cosines[:, position] > smallest) & ~np.isnan(ratios).any(axis=1)]
         intensity = np.median(ratios, axis=0) if len(ratios) >= 50 else np.zeros(1)
@@ -87,7 +86,8 @@ def measure_light_intensities(
                 "the target is dark or overexposed under this light, so the light's intensity is"
                 " unknown",
                 path=path,
-                hint="Every light needs an image of the target that is neither black nor saturated",
+                hint="For every light, take an image of the target that is neither black nor"
+                " saturated",
             )
         intensities[position] = intensity
     return np.asarray(intensities / intensities.mean())
@@ -96,9 +96,8 @@ def measure_light_intensities(
 def read_target(
     files: BallFiles, target: Target, radiometry: RadiometricCalibration
 ) -> tuple[Float64Array, Indices, Iterator[StoredPixels]]:
-    """Return the normals (P, 3) of a target, and an iterator over its images.
-
-    Of each image, it yields the pixels whose numbers are returned, too.
+    """Return the normals (P, 3) of a target, the indices of sampled pixels, and their values by
+    image.
     """
     mask, normals = _target_normals(files, common_size(files.facts)[0][:2], target)
     check_exposures(files.facts)
@@ -137,7 +136,7 @@ def _target_normals(
     return mask, circle.normals(x.astype(np.float64), y.astype(np.float64))
 
 
-# standard deviation of highlights, and of the middle and the radius of outlines, in pixels
+# standard deviation in pixels of highlights, and of the centre and the radius of outlines
 _PIXEL_ERROR = 0.3
 
 
@@ -145,19 +144,19 @@ _PIXEL_ERROR = 0.3
 class LampPositions:
     """The positions of F lamps; x right, y up, z to the camera.
 
-    The origin is the middle of the image on the balls' plane.
+    The origin is at the centre of the image, on the balls' plane.
     """
 
     positions: Float64Array  # (F, 3)
-    uncertainty: Float64Array  # (F,), the distance within which 95 % of the true positions are
+    uncertainty: Float64Array  # (F,), the distance that contains the true position in 95 % of cases
     # the width of a pixel on the plane, in the unit of the positions; 1 if they are in pixels
     pixel_size: float
     view: View
 
     @property
     def known(self) -> bool:
-        """Whether every lamp has a position in front of the balls that the rays determine well."""
-        # With a larger uncertainty the rays are nearly parallel, and the lamp may be at any
+        """Whether every lamp has a well-determined position in front of the balls."""
+        # If the uncertainty is larger, the rays are nearly parallel, and the lamp may be at any
         # distance.
         most = 0.4 * np.linalg.norm(self.positions, axis=1)
         return bool((self.positions[:, 2] > 0).all() and (self.uncertainty <= most).all())
@@ -166,15 +165,17 @@ class LampPositions:
 def triangulate_lamps(
     balls: Sequence[BallCalibration], *, ball_diameter: float | None = None
 ) -> LampPositions | None:
-    """Return the positions of the lamps from balls photographed by one camera.
+    """Return the positions of the lamps from balls photographed by one camera; None for a single
+    place.
 
-    Return None for balls at one place. The uncertainty comes from repeating the computation with
-    other pixels, heights of the balls and cameras (View.draw). It is larger if the rays miss each
-    other by more than this explains.
+    The uncertainty is found by repeating the computation with random errors of the pixels, the
+    heights of the balls and the camera (View.draw). It is increased if the rays miss each other by
+    more than these errors explain.
 
     Args:
-        balls: at least two balls, or one at two places.
-        ball_diameter: of each ball, in the unit of the result. None leaves positions in pixels.
+        balls: at least two balls, or one ball at two places.
+        ball_diameter: the diameter of each ball, in the unit of the result. If it is None, the
+            positions are in pixels.
     """
     circles = [ball.circle for ball in balls]
     apart = max(math.hypot(circle.x - circles[0].x, circle.y - circles[0].y) for circle in circles)
@@ -186,7 +187,7 @@ def triangulate_lamps(
     drawn = [_positions(balls, view.draw(generator), ball_diameter, generator) for _ in range(200)]
     errors = np.array([np.linalg.norm(other - positions, axis=1) for other, _, _ in drawn])
     errors[np.isnan(errors)] = np.inf
-    # If _PIXEL_ERROR is right, each draw adds as much to the misses as the images' own pixel errors
+    # If _PIXEL_ERROR is correct, a draw increases the misses by as much as the errors in the images
     # did.
     added = float(np.nanmedian([other for _, _, other in drawn])) - miss
     excess = math.sqrt(max(1.0, miss / added if added > 0 else 1.0))
@@ -200,10 +201,9 @@ def _positions(
     diameter: float | None,
     errors: np.random.Generator | None = None,
 ) -> tuple[Float64Array, float, float]:
-    """Return the positions (F, 3), the pixel size and the mean square angle between the rays.
+    """Return the positions (F, 3), the pixel size and the mean square angle by which the rays miss.
 
-    It is the angle by which the rays miss each other. `errors` draws errors of the pixels; None
-    takes them as they are.
+    `errors` draws random errors of the pixels; None adds no errors.
     """
 
     def error(*shape: int) -> Float64Array:
@@ -215,9 +215,9 @@ def _positions(
     depths = -centres[:, 2]
     shares = np.array([_PIXEL_ERROR / ball.circle.radius for ball in balls])
     plane = float(depths.mean() * (1 + (shares * error(len(balls))).mean()))
-    # The most probable depths, and their errors, given those from the outlines and the usual
-    # difference between the heights of centres, half a radius. It matters under a distant camera,
-    # where outlines do not give the heights.
+    # The most probable depths, given the depths from the outlines and a standard deviation of half
+    # a radius between the heights of the centres. This matters for a distant camera, where the
+    # outlines do not determine the heights.
     weights = 0.5**2 / (0.5**2 + (shares * depths) ** 2)
     likely = (
         plane
@@ -243,16 +243,16 @@ def _positions(
 def intersect_rays(starts: Float64Array, directions: Float64Array) -> tuple[Float64Array, float]:
     """Return the points (F, 3) nearest to B rays each, and the mean square angle of the misses.
 
-    The rays are (B, F, 3), B at least 2, with unit directions that have equal random errors. A NaN
-    gives NaN.
+    The rays are (B, F, 3), B at least 2, with unit directions that have equal random errors. Points
+    of rays with NaN are NaN.
     """
     usable = np.isfinite(directions).all(axis=(0, 2))
     points = np.full(starts.shape[1:], np.nan)
     starts, directions = starts[:, usable], directions[:, usable]
-    # Projections across each ray: their sum is singular for parallel rays.
+    # Projections perpendicular to each ray. Their sum is singular for parallel rays.
     across = np.eye(3) - directions[..., :, None] * directions[..., None, :]
     weights = np.ones(starts.shape[:2])
-    # An error of direction is weighted in proportion to the distance, which is not known at first.
+    # Distances to a ray are weighted by the distance along it, which is not known at first.
     for _ in range(3):
         weighted = across * weights[..., None, None]
         right_side = np.einsum("bfij,bfj->fi", weighted, starts)
@@ -274,12 +274,12 @@ def calibration_report(
     picture: str,
     lamps: LampPositions | None = None,
 ) -> dict[str, Any]:
-    """Return the report of a calibration as values for JSON, with its warnings.
+    """Return the report of a calibration, including its warnings, as JSON values.
 
     Args:
         intensities: (F, 3), or None if they were not measured.
         known_directions: (F, 3) unit vectors to compare the result with, or None.
-        picture: the name of the picture to which warnings refer.
+        picture: the name of the picture that warnings refer to.
     """
     single, view = len(lights.balls) == 1, lights.balls[0].view
     off_deg = (
@@ -324,9 +324,9 @@ def calibration_report(
 
 
 def calibration_lines(report: dict[str, Any]) -> list[str]:
-    """Return the lines of a report for people.
+    """Return the lines of a report on the terminal.
 
-    They state the outlines, and how well the balls and the compared lights agree.
+    They describe the outlines, and how well the balls and the compared lights agree.
     """
     lines = []
     for ball in report["balls"]:
@@ -343,7 +343,7 @@ def calibration_lines(report: dict[str, Any]) -> list[str]:
         )
     lamps = report["lamp_positions"]
     if lamps and not lamps["known"]:
-        lines.append("the lamps' distances are unknown: they are treated as distant")
+        lines.append("the lamps' distances are unknown, so the lamps are treated as distant")
     elif lamps:
         distances = np.linalg.norm(lamps["positions"], axis=1)
         shares = 100 * np.array(lamps["uncertainty"]) / distances
@@ -364,22 +364,22 @@ def _warnings(
     warnings = [
         f"{ball.files.folder}: the outline of the ball is uncertain"
         f" ({100 * ball.circle.visible:.0f} % of it visible, spread {ball.circle.spread:.1f}"
-        f" pixels). Check {picture}; if the green circle is wrong, give --mask or --circle."
+        f" pixels). Check {picture}; if the green circle is wrong, add --mask or --circle."
         for ball in lights.balls
-        # Less of the outline is visible, or it varies by more than 1 % of the radius.
+        # too little of the outline is visible, or it varies by more than 1 % of the radius
         if ball.circle.visible < 0.6 or ball.circle.spread > 0.01 * ball.circle.radius
     ]
     if lamps is not None and not lamps.known:
         warnings.append(
             "The rays from the balls are too parallel to measure the lamps' distances. If the"
-            " lamps are near, put the balls farther apart."
+            " lamps are near, move the balls farther apart."
             if lamps.view.known
-            else "The lamps' distances are unknown, because the camera is: it is treated as"
-            " distant, which makes the rays from the balls too parallel if it is near. If the"
+            else "The lamps' distances are unknown, because the camera is unknown and treated as"
+            " distant. If it is near, this makes the rays from the balls too parallel. If the"
             " lamps are near, add --camera-matrix."
         )
     worst = int(lights.disagreement_deg.argmax())
-    largest = lights.disagreement_deg[worst]  # of exact balls it is below 5
+    largest = lights.disagreement_deg[worst]  # below 5 for accurate balls
     if largest > 5.0 and not (lamps is not None and lamps.known):
         warnings.append(
             f"The balls disagree by up to {largest:.1f} degrees, most under light {worst + 1}"
@@ -390,11 +390,11 @@ def _warnings(
         from_normals = np.mean(
             [angle_between_deg(known, ball.normals).mean() for ball in lights.balls]
         )
-        # Smaller differences do not indicate a wrong frame.
+        # Smaller differences may have other causes.
         if difference > 3.0 and from_normals < difference / 3:
             warnings.append(
-                "The compared file contains the normals of the ball at the highlights instead of"
-                " the light directions: each is half-way between the view and the light. Use the"
+                "The compared file contains the normals of the ball at the highlights, which are"
+                " halfway between the view and the light, instead of the light directions. Use the"
                 " file written here."
             )
     return warnings
