@@ -223,7 +223,7 @@ def test_a_display_encoded_target_is_reported(run):
     assert intensities[0] == intensities[1]
     run(arguments, says="are read as sRGB. Add --transfer linear")
     assert "--transfer srgb reverses" not in run(f"{arguments} --transfer srgb").err
-    run(arguments, says="The light intensities are in calibration/light_intensities.txt\n")
+    run(arguments, says="The light intensities were written to calibration/light_intensities.txt\n")
     # Those of earlier lights are removed.
     run("calibrate ball --overwrite")
     assert not Path("calibration/light_intensities.txt").exists()

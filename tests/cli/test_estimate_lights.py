@@ -73,7 +73,7 @@ def test_a_light_file_of_the_user_is_kept(unlit, run):
     own = "\n".join("0 0 1" for _ in LIGHTS)
     (unlit / "light_directions.txt").write_text(own)
     command = f"infer {unlit} --lights estimate --intensities equal --method ls -o ."
-    run(command, code=5, says="not from an earlier run")
+    run(command, code=5, says="not written by an earlier run")
     assert (unlit / "light_directions.txt").read_text() == own
     (unlit / "light_directions.txt").unlink()
     run(command)
@@ -134,7 +134,7 @@ def test_contradictions(unlit, run):
         "evaluate --light-noise-deg 2",
     ):
         run(f"{command} {unlit} --lights estimate", code=2, says="--lights estimate")
-    run(f"info {unlit} --check-lights", code=2, says="the lights are estimated without one")
+    run(f"info {unlit} --check-lights", code=2, says="but the lights are estimated")
     assert not Path("out").exists()
 
 
@@ -179,7 +179,7 @@ def test_films_that_cannot_be_used(run):
     film = write_film(Path("clip.avi"), sphere_film(np.repeat(path_of_lamp(1), 10, axis=0)))
     film.with_name("...mp4").write_bytes(film.read_bytes())
     for code, arguments, words in (
-        (2, f"{film} --light-frame x-left", "Leave out options about lights that are given"),
+        (2, f"{film} --light-frame x-left", "Leave out options about given lights"),
         (
             3,
             f"{film} --lights estimate",

@@ -120,7 +120,7 @@ REFUSED_ARGUMENTS = """
 --maps albedo,depth | 2 | --maps has 'depth'
 --transfer rec709 | 2 | 'rec709'; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10
 --white-level 0 | 2 | --white-level is '0'; expected a number above 0
---weights spline-net | 2 | method ls uses no weights
+--weights spline-net | 2 | method ls does not use weights
 --maps confidence | 2 | method ls does not provide confidence
 --update --overwrite | 2 | --overwrite and --update cannot be used together
 --workers 0 | 2 | --workers is '0'; expected a number of at least 1, or auto

@@ -101,7 +101,7 @@ def test_the_plot_replaces_no_photograph(run, capture):
         run(
             f"info {capture} --plot {capture / name}",
             code=2,
-            says="would be in the folder of the images",
+            says="would be read as an image of the capture",
         )
     Path("mine.png").write_bytes(b"mine")
     run(f"info {capture} --plot mine.png", code=5)

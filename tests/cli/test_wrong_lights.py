@@ -108,7 +108,7 @@ def test_mended_lights(run, medallion):
     right = np.loadtxt(medallion / "light_directions.txt")
     good = run(f"info {medallion} --mended-lights mended.txt")
     assert not Path("mended.txt").exists()
-    assert "not written: no other reading of the lights fits clearly better" in good.out
+    assert "not written, because no other reading of the lights fits clearly better" in good.out
     write_lights(medallion, lambda lights: np.roll(lights, 2, axis=0)[:, [1, 0, 2]])
     report = run(f"info {medallion} --mended-lights mended.txt --json").json
     assert report["mended_lights"] == "mended.txt"

@@ -135,7 +135,7 @@ def test_captures_that_cannot_be_scored_are_skipped(write_dome, tmp_path):
     assert str(broken / "003.png") in reasons[1]
     assert (
         reasons[2]
-        == "the capture has 4 lights, too few for draws of 5. Use --n-lights 4, or fewer."
+        == "the capture has only 4 lights, but --n-lights is 5. Use --n-lights 4, or fewer."
     )
     assert str(tmp_path / "missing") in reasons[3]
 
@@ -149,7 +149,7 @@ def test_nothing_scored_is_an_error(write_dome, tmp_path):
     for folders, error, message in (
         ([untrue, few], InputError, none),
         ([untrue], InputError, "untrue: the capture has no ground truth"),
-        ([few], UsageError, "the capture has 4 lights, too few for draws of 5"),
+        ([few], UsageError, "the capture has only 4 lights, but --n-lights is 5"),
     ):
         with pytest.raises(error, match=message):
             evaluate(folders, LS, Protocol(n_lights=5))

@@ -14,7 +14,7 @@ from splinecli.estimate.confidence import add_common_error
 from splinecli.estimate.light_descent import best_lights
 from splinecli.lights import unknown_lights
 from splinecli.lights.outline import outline_share, turn_at_outline
-from splinecli.lights.unknown_lights import bump_log_odds, lower_lights
+from splinecli.lights.unknown_lights import bump_log_odds
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.records.capture_warnings import ESTIMATED_LIGHTS
 
@@ -255,23 +255,3 @@ def test_a_wrong_guess_of_the_network_is_turned_around(hollow, monkeypatch):
     monkeypatch.setattr(unknown_lights, "_ask_network", lambda *_: guess)
     found = find_lights(cap_on_plate(64, lights, hollow=hollow), mask, True, refuse=False)
     assert angle_between_deg(found.directions, lights).mean() < 11
-
-
-@pytest.mark.parametrize("raised", [1.0, 1.6])
-def test_low_lights_are_lowered_until_the_albedo_is_even(raised):
-    normals, inside = sphere(64)
-    lights = ring_lights(8, 65)
-    images = shade(normals[inside], lights, noise=0.002).astype(np.float32)
-    given = unit(lights * (1, 1, raised))
-    before, after = (
-        angle_between_deg(found, lights).mean()
-        for found in (given, lower_lights(images, given, 10.0))
-    )
-    assert after <= max(0.5 * before, 0.5)
-
-
-def test_high_lights_are_not_lowered():
-    normals, inside = sphere(64)
-    lights = ring_lights(8, 30)
-    images = shade(normals[inside], lights).astype(np.float32)
-    assert_array_equal(lower_lights(images, lights, 10.0), lights)

@@ -120,12 +120,12 @@ def test_a_task_for_no_worker(client, work):
 def test_workers_that_do_not_fit(client, work, tmp_path):
     good = work(worker_tasks.double)
     cases = {
-        "found splinecli [0-9.]+, expected 9.9 as on this machine": (
+        "found splinecli [0-9.]+, expected 9.9 as on the command's machine": (
             UsageError,
             replace(good, versions={**good.versions, "splinecli": "9.9"}),
         ),
         "nowhere: the folder cannot be entered": (InputError, replace(good, folder="nowhere")),
-        "elsewhere: the folder is not the one of this machine": (
+        "elsewhere: the worker's folder is not the folder of the command's machine": (
             InputError,
             replace(good, probe=str(tmp_path / "elsewhere/probe")),
         ),

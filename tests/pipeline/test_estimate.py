@@ -81,7 +81,7 @@ def test_what_cannot_be_learned_is_left_to_the_network(monkeypatch):
     teacher = Slow(random=True)
     found, (warning,) = distil_for(capture(3000), teacher, True)
     assert found is None
-    assert warning.code == "not_distilled" and "expects errors of 2.9 degrees" in warning.text
+    assert warning.code == "not_distilled" and "the full network are 2.9 degrees" in warning.text
     assert teacher.asked == 500 + 900  # both sizes were tried
 
 
@@ -90,7 +90,7 @@ def test_refused():
         (
             capture(3000),
             LeastSquares(),
-            "method ls does not provide confidence and cannot be distilled",
+            "method ls cannot be distilled, because it does not provide confidence",
         ),
         (capture(200), Slow(), "matte: 200 pixels are too few to distil"),
     ):

@@ -1,1 +1,1 @@
-"""The work of each command on one or more captures, independent of the terminal."""
+"""The work of each command on one or more captures, without a terminal."""

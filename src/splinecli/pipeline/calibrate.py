@@ -1,4 +1,6 @@
-"""Calibrate lights: images of balls and of a gray target in, light files and a report out."""
+"""Calibrate lights: read images of balls and of a gray target, and write light files and a
+report.
+"""
 
 import json
 from collections.abc import Sequence
@@ -45,11 +47,11 @@ OUTPUT_FILES = (
 def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> dict[str, Any]:
     """Calibrate the lights, write OUTPUT_FILES and return the report.
 
-    Raises InputError, OutputError.
+    Raises InputError or OutputError.
     """
     with held_folder(options.output, observer.warn):
         check_free(options.output, OUTPUT_FILES, overwrite=options.overwrite)
-        # Report a wrong path now, not only after all images have been read.
+        # Report a wrong path before all images are read.
         balls, target_files = _find_files(options, observer)
         known = None
         if options.compare is not None:
@@ -74,19 +76,21 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
         said = calibration_lines(report)
         if intensities is not None:
             texts[INTENSITIES] = rows_text(intensities)
-            said.append(f"The light intensities are in {options.output / INTENSITIES}")
+            said.append(f"The light intensities were written to {options.output / INTENSITIES}")
         if crosstalk is not None:
             texts[CROSSTALK] = rows_text(crosstalk.reshape(-1, 3))
             place = options.output / CROSSTALK
-            said.append(f"The crosstalk is in {place}, for infer --lights-in-channels")
+            said.append(f"The crosstalk was written to {place}, for infer --lights-in-channels")
         if lamps is not None and lamps.known:
             texts[POSITIONS] = rows_text(lamps.positions)
             texts[PIXEL_SIZE] = f"{lamps.pixel_size:.9g}\n"
             place = options.output / POSITIONS
-            said.append(f"The positions of the lamps are in {place}, for --light-positions")
+            said.append(
+                f"The positions of the lamps were written to {place}, for --light-positions"
+            )
             if lamps.view.known:
                 texts[CAMERA_MATRIX] = rows_text(lamps.view.matrix)
-        # Remove files that this run does not overwrite, because they belong to earlier lights.
+        # Earlier files that are not overwritten are removed, because they belong to other lights.
         with new_files(options.output, report=REPORT, stale=OUTPUT_FILES) as new:
             for name, text in texts.items():
                 new.write(name, text)
@@ -114,7 +118,7 @@ def _find_files(
 
 
 def _check_outlines(balls: Sequence[BallCalibration], options: CalibrateOptions) -> None:
-    """Write the picture and raise InputError if an outline may not be that of a ball."""
+    """Write the picture and raise InputError if an outline may not belong to a ball."""
     for ball in balls:
         if ball.doubt is None:
             continue

@@ -1,7 +1,7 @@
 """Map a function over items in other processes, on this machine or on a Dask cluster.
 
-Workers receive paths and return reports; arrays are never transferred. Dask repeats an item if its
-worker is lost.
+Workers receive paths and return reports; arrays are never transferred. If a worker is lost, Dask
+repeats its item.
 """
 
 from __future__ import annotations
@@ -39,12 +39,13 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 
-# a server has to answer as a scheduler
+# timeouts for a scheduler's answers
 CONNECT_SECONDS, ANSWER_SECONDS, CLOSE_SECONDS = (5.0, 6.0, 5.0)
 _LOOK_SECONDS = 0.5  # between two updates of the list of workers
-# item per worker: the working folder and PyTorch's threads are shared by the whole process
+# A worker processes one item at a time, because the working folder and PyTorch's threads are shared
+# by the whole process.
 _ONE_AT_A_TIME = Lock()
-SAME_STORAGE = "Workers need the storage of this machine at the same place, for example by NFS"
+SAME_STORAGE = "Workers must access this machine's storage under the same path, for example by NFS"
 SAME_VERSIONS = "Install the same versions on all workers and the scheduler"
 
 
@@ -52,7 +53,7 @@ SAME_VERSIONS = "Install the same versions on all workers and the scheduler"
 def connected(options: ClusterOptions) -> Iterator[Client]:
     """Yield a Dask client of a new cluster on this machine, or of a running cluster.
 
-    Raises UsageError if Dask is not installed, or no scheduler answers at the address.
+    Raises UsageError if Dask is not installed, or if no scheduler answers at the address.
     """
     distributed = import_extra("distributed", "cluster")
     if options.address is None:
@@ -78,9 +79,9 @@ def _client(address: str) -> Client:
         async with rpc(address, timeout=CONNECT_SECONDS) as server:
             return await asyncio.wait_for(server.identity(), ANSWER_SECONDS)
 
-    # A client waits forever for a server that is not a scheduler, and a client that fails to start
-    # can block Dask's event loop when Python deletes it. We therefore identify the server first.
-    # This runs in a separate thread, because the current one may already have an event loop.
+    # The server is identified first, because a client waits forever for a server that is not a
+    # scheduler, and a client that fails to start can block Dask's event loop when Python deletes
+    # it. This runs in a separate thread, because the current one may already have an event loop.
     try:
         with ThreadPoolExecutor(1) as thread:
             identity = thread.submit(asyncio.run, identify()).result()
@@ -109,7 +110,7 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     loggers = ("distributed", *(f"distributed.{part}" for part in parts), "tornado")
     settings: dict[str, Any] = {
         "distributed.nanny.pre-spawn-environ": environment,
-        # No data for a dashboard, which cost processor time and an hour of memory
+        # Collect no data for a dashboard, because they cost processor time and memory.
         "distributed.admin.low-level-log-length": 100,
         "distributed.admin.system-monitor.log-length": 10,
         "distributed.admin.system-monitor.interval": "10s",
@@ -119,8 +120,7 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
         "distributed.worker.profile.enabled": False,
         # If a worker is lost, its item is retried twice. A running cluster has its own setting.
         "distributed.scheduler.allowed-failures": 2,
-        # A terminal sends Ctrl-C to the workers, too, but the command should be the one to stop
-        # them.
+        # A terminal also sends Ctrl-C to the workers, but only the command should stop them.
         "distributed.worker.preload": [
             "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)"
         ],
@@ -139,15 +139,15 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
                 dashboard_address="127.0.0.1:0",
                 silence_logs=logging.CRITICAL,
             )
-        except RuntimeError as error:  # its cause may be an error of the operating system
+        except RuntimeError as error:  # possibly caused by an error of the operating system
             cause: BaseException | None = error
             while cause is not None and not isinstance(cause, OSError):
                 cause = cause.__cause__
             reason = "" if cause is None else f" ({cause.strerror or cause})"
             raise SplinecliError(
                 f"the processes of --workers cannot be started{reason}",
-                hint="Leave --workers out, or raise the limits: each needs a temporary folder and"
-                " 50 open files",
+                hint="Leave --workers out, or raise the limits: each process needs a temporary"
+                " folder and 50 open files",
             ) from error
         try:
             yield cluster
@@ -171,20 +171,19 @@ def _address(text: str) -> str:
         raise UsageError(
             f"--cluster is {text}; expected an address such as tcp://scheduler:8786, or a"
             " scheduler file",
-            hint="'dask scheduler --scheduler-file FILE' writes such a file",
+            hint="Write a scheduler file with 'dask scheduler --scheduler-file FILE'",
         ) from None
 
 
 class LostError(SplinecliError):
-    """An item failed because its worker was lost or has too little memory.
-
-    Other items may still succeed.
+    """An item failed because its worker was lost or has too little memory. Other items may
+    succeed.
     """
 
 
 @dataclass(frozen=True)
 class WorkItem:
-    """The arguments of Work.do, a name for messages, and the memory needed in bytes."""
+    """The arguments of Work.do, a name for messages, and the required memory in bytes."""
 
     args: tuple[Any, ...]
     name: str
@@ -197,14 +196,14 @@ def _versions() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Work:
-    """The settings shared by all items of a command; they are sent with each item."""
+    """The settings shared by all items of a command, which are sent with each item."""
 
-    # from the arguments of an item to the result; or raises an error about the worker
+    # returns the result for the arguments of an item, or raises an error about the worker
     do: Callable[..., Any]
-    probe: str  # a file in the output folder; a worker that cannot find it uses different storage
-    # of the command, against which relative paths are resolved
+    probe: str  # a file in the output folder; a worker that cannot find it uses other storage
+    # working folder of the command, which relative paths refer to
     folder: str = field(default_factory=os.getcwd)
-    versions: dict[str, str] = field(default_factory=_versions)  # of packages that must match
+    versions: dict[str, str] = field(default_factory=_versions)  # package versions that must match
 
     def enter(self) -> None:
         """Prepare this worker.
@@ -214,7 +213,7 @@ class Work:
         for package, found in _versions().items():
             if found != (expected := self.versions[package]):
                 raise UsageError(
-                    f"found {package} {found}, expected {expected} as on this machine",
+                    f"found {package} {found}, expected {expected} as on the command's machine",
                     hint=SAME_VERSIONS,
                 )
         try:
@@ -225,11 +224,11 @@ class Work:
                 path=self.folder,
                 hint=SAME_STORAGE,
             ) from None
-        deadline = time.monotonic() + 3.0  # a network drive may show a new file a little later
+        deadline = time.monotonic() + 3.0  # a new file may appear on a network drive with a delay
         while not (probe := Path(self.probe)).exists():
             if not probe.parent.exists() or time.monotonic() > deadline:
                 raise InputError(
-                    "the folder is not the one of this machine",
+                    "the worker's folder is not the folder of the command's machine",
                     path=probe.parent,
                     hint=SAME_STORAGE,
                 )
@@ -243,7 +242,9 @@ def this_worker() -> str:
 
 
 def _do(work: Work, *args: Any) -> Any:
-    """Process an item on a worker and return its result. Error messages name the worker."""
+    """Process an item on a worker and return its result. Error messages contain the worker's
+    address.
+    """
     try:
         with _ONE_AT_A_TIME:
             work.enter()
@@ -259,7 +260,7 @@ def _do(work: Work, *args: Any) -> Any:
 
 @dataclass
 class Distributor:
-    """Assigns items to the workers of a Dask cluster, at most one at a time each.
+    """Assigns items to the workers of a Dask cluster, one at a time to each worker.
 
     Workers may join and leave.
     """
@@ -272,9 +273,10 @@ class Distributor:
     _done: SimpleQueue[Future] = field(default_factory=SimpleQueue)
 
     def run(self, items: Iterable[WorkItem]) -> Iterator[tuple[WorkItem, Any]]:
-        """Yield each item with its result, or with a LostError, as it finishes.
+        """Yield each item with its result, or with a LostError, as soon as it is done.
 
-        Raises SplinecliError, also if the scheduler was lost. The message names the worker.
+        Raises SplinecliError, also if the scheduler is lost. The message contains the worker's
+        address.
         """
         # A worker without splinecli could not even unpickle an item.
         for address, found in self.client.run(
@@ -296,8 +298,8 @@ class Distributor:
             # A cluster on this machine is considered lost after a minute.
             elif not self.options.address and time.monotonic() - began > 60.0:
                 raise SplinecliError(
-                    "the workers stop while they start",
-                    hint="If there is too little memory, use fewer. Dask's output says more",
+                    "the workers stop while they are starting",
+                    hint="If memory is short, use fewer workers. Dask's output has the details",
                 )
             while following is not None and len(self.running) < len(workers):
                 limits = (
@@ -313,18 +315,13 @@ class Distributor:
                     else sum(item.memory for item in self.running.values())
                 )
                 if following.memory > largest:
-                    problem = (
+                    error = LostError(
                         f"it takes about {following.memory / 1e9:.1f} GB of memory, but the"
-                        " largest worker has"
+                        f" largest worker has only {largest / 1e9:.1f} GB",
+                        path=following.name,
+                        hint="Start fewer workers on each machine, with more memory each",
                     )
-                    yield (
-                        following,
-                        LostError(
-                            f"{problem} {largest / 1e9:.1f} GB",
-                            path=following.name,
-                            hint="Start fewer workers on each machine, with more memory each",
-                        ),
-                    )
+                    yield following, error
                 elif not used or used + following.memory <= free_memory:
                     self._submit(following, workers)
                 else:
@@ -334,7 +331,7 @@ class Distributor:
                 yield from self._take_result(self._done.get(timeout=_LOOK_SECONDS))
 
     def _workers(self) -> dict[str, dict[str, Any]]:
-        """Return Dask's information on the usable workers.
+        """Return Dask's information about the usable workers.
 
         Raises SplinecliError if the scheduler is lost.
         """
@@ -352,8 +349,8 @@ class Distributor:
         if found and not with_gpu and not self.running:
             raise UsageError(
                 "no worker has the Dask resource GPU",
-                hint="Start the workers of machines with a GPU with 'dask worker ADDRESS"
-                " --resources GPU=1'",
+                hint="On machines with a GPU, start workers with 'dask worker ADDRESS --resources"
+                " GPU=1'",
             )
         return with_gpu
 
@@ -382,7 +379,7 @@ class Distributor:
         except TimeoutError:
             if future.status == "error":  # the item itself failed
                 raise
-            # the worker was lost with the result: Dask repeats it
+            # The worker was lost with its result, so Dask repeats the item.
             future.add_done_callback(self._done.put)
             return
         except KilledWorker as error:
@@ -390,8 +387,8 @@ class Distributor:
             result = LostError(
                 f"its worker was lost {error.allowed_failures + 1} times, the last one {last}",
                 path=item.name,
-                hint="If there was too little memory, start fewer workers on each machine, or make"
-                " the images smaller",
+                hint="If memory was short, start fewer workers on each machine, or reduce the"
+                " images",
             )
         del self.running[future]
         yield item, result
@@ -412,16 +409,16 @@ def _scheduler_lost() -> SplinecliError:
 def distributor(
     do: Callable[..., Any], output: Path, options: ClusterOptions, observer: Observer
 ) -> Iterator[Distributor]:
-    """Yield a Distributor with a connection to its workers.
+    """Yield a Distributor that is connected to its workers.
 
-    Raises UsageError as `connected` does, or OutputError. The output folder, which is created if
-    needed, serves to check that the workers use the same storage.
+    Raises UsageError as `connected` does, or OutputError. The output folder is created if needed,
+    because it serves to check that the workers use the same storage.
     """
     probe = output / f".{uuid.uuid4().hex}{UNFINISHED}"
     with ExitStack() as stack:
         with refusals_as_output_errors(output):
             stack.enter_context(made_folder(output))
-            # Lock the file, so that no other batch removes it as a leftover of a killed process.
+            # Without a lock, another batch would remove the file as a leftover of a killed process.
             stack.enter_context(locked_file(probe, wait=True))
         client = stack.enter_context(connected(options))
         yield Distributor(client, Work(do, str(probe.absolute())), options, observer)

@@ -53,11 +53,11 @@ class EvaluateOutcome(NamedTuple):
 
 
 def evaluate_captures(options: EvaluateOptions, observer: Observer = SILENT) -> EvaluateOutcome:
-    """Score the methods on the captures, and write the results to the output folder.
+    """Score the methods on the captures, write the results to the output folder and return them.
 
     All options are checked before the first image is read. Raises UsageError, ModelError,
-    OutputError, or InputError if no capture could be scored, or a folder or the draws file is
-    wrong.
+    OutputError, or InputError if no capture could be scored, or if a folder or the draws file is
+    invalid.
     """
     captures = [capture for dataset in options.datasets for capture in find_captures(dataset)]
     output, protocols = Path(options.output), options.protocols
@@ -66,7 +66,7 @@ def evaluate_captures(options: EvaluateOptions, observer: Observer = SILENT) -> 
     estimators = [make_estimator(name, options.method_options) for name in options.names]
     if options.weights is not None and not any(each.weights for each in estimators):
         names = ", ".join(options.names)
-        raise UsageError(f"no weights are used by {names}", hint="Leave --weights out")
+        raise UsageError(f"--weights does not apply to {names}", hint="Leave --weights out")
     on_gpu = any(estimator.device.startswith("cuda") for estimator in estimators)
     elsewhere: Elsewhere | None = None
     if cluster := options.cluster.on_cores():
@@ -116,14 +116,13 @@ def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> No
     """Raise UsageError if the number of lights exceeds the lights of every capture."""
     most = 0
     for capture in captures:
-        # The evaluation skips the capture and reports the reason.
+        # For other captures, the evaluation reports the reason.
         with suppress(InputError, OSError):
             most = max(most, open_capture(capture).n_lights)
     for protocol in protocols:
         if most and protocol.n_lights is not None and protocol.n_lights > most:
             raise UsageError(
-                f"the captures have at most {most} lights, too few for draws of"
-                f" {protocol.n_lights}",
+                f"the captures have at most {most} lights, but --n-lights is {protocol.n_lights}",
                 hint=f"Use --n-lights {most}, or fewer",
             )
 
@@ -131,9 +130,9 @@ def _check_counts(captures: Sequence[Path], protocols: Sequence[Protocol]) -> No
 def _try_each(
     label: str, tasks: Sequence[Callable[[Advance], Found]], observer: Observer
 ) -> tuple[list[Found], list[str]]:
-    """Return the results of the tasks that succeed, and why the others failed.
+    """Return the results of the tasks that succeed, and the reasons why the others fail.
 
-    Each task is given the function that counts its progress.
+    Each task is given a function that counts its progress.
     """
     found: list[Found] = []
     problems: list[str] = []
@@ -156,10 +155,8 @@ def _score_on_workers(
 ) -> Iterator[tuple[DrawTask, Scored]]:
     """Yield the draws with their scores as they finish, one item per draw.
 
-    Only this process writes to the store.
-
-    Raises LostError if the workers of a draw were lost, after all others were scored; or see
-    Distributor.run.
+    Only this process writes to the store. After all other draws were scored, raises LostError if
+    the workers of a draw were lost. Other errors are as in Distributor.run.
     """
     fingerprints = tuple((estimator.name, estimator.fingerprint) for estimator in estimators)
     score = partial(_score, uuid.uuid4().hex, fingerprints, method_options)
@@ -186,17 +183,17 @@ def _score(
 def _scorer(
     _command: str, fingerprints: tuple[tuple[str, str], ...], options: MethodOptions
 ) -> Callable[[DrawTask], Scored]:
-    """Return the function that scores draws of the worker's current command.
+    """Return a function that scores draws on the worker, for one command.
 
-    It keeps the last capture in memory. It is not reused by other commands, because files may
+    The function keeps the last capture in memory. Each command has its own, because files may
     change in between.
     """
     estimators = {name: make_estimator(name, options) for name, _ in fingerprints}
     for name, expected in fingerprints:
         if (found := estimators[name].fingerprint) != expected:
             raise ModelError(
-                f"{name} is {found} here, expected {expected} as on the machine of the command",
-                hint="Use the same weight file everywhere, and the same --precision",
+                f"{name} is {found} here, expected {expected} as on the command's machine",
+                hint="Use the same weight file and the same --precision on all machines",
             )
     last: tuple[CaptureReading, TrialSource, Notes] | None = None
 

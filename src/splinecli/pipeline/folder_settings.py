@@ -1,4 +1,4 @@
-"""How a capture is read, as stated by the file splinecli.toml in its folder."""
+"""Options for reading a capture from the file splinecli.toml in its folder."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from splinecli.system.files import resolve
 SETTINGS = "splinecli.toml"
 CORRECT = "Correct the line, or remove it"
 _WORDS = {"lights": "estimate", "intensities": "equal"}  # instead of files
-OUTSIDE = "Copy the file into the folder, or name it with the option on the command line"
+OUTSIDE = "Copy the file into the folder, or pass it with the option on the command line"
 Options = TypeVar("Options", bound=records.Record)
 
 
 def read_settings(folder: Path, kind: type[records.Record]) -> dict[str, Any]:
-    """Return the values of splinecli.toml in a folder, which name fields of `kind` with hyphens.
+    """Return the values of splinecli.toml in a folder. Its keys are fields of `kind` with hyphens.
 
-    Paths in it are returned relative to the working directory. Raises InputError if the file is not
-    TOML, a name or type is wrong, a path leaves the folder, or the folder cannot be read.
+    Paths are returned relative to the working directory. Raises InputError if the file is not TOML,
+    a name or type is invalid, a path is outside the folder, or the folder cannot be read.
     """
     path = find_named(folder, [SETTINGS])
     if path is None:
@@ -48,14 +48,14 @@ def read_settings(folder: Path, kind: type[records.Record]) -> dict[str, Any]:
         line = names.index(key) + 1 if key in names else None
         fail = partial(InputError, path=path, line=line, hint=CORRECT)
         if key not in kinds:
-            raise fail(f"unknown setting {key!r}; known are {', '.join(sorted(kinds))}")
+            raise fail(f"unknown setting {key!r}, expected one of {', '.join(sorted(kinds))}")
         try:
             one = records.converted(kinds[key], value, f"setting {key!r}", InputError)
         except InputError as error:
             raise fail(error.problem) from None
         if records.is_file_name(kinds[key]) and one != _WORDS.get(key):
             if not resolve(folder / one).is_relative_to(resolve(folder)):
-                problem = f"{key} is {one!r}, which is outside the folder; expected a path inside"
+                problem = f"{key} is {one!r}, expected a path inside the folder"
                 raise fail(problem, hint=OUTSIDE)
             one = str(folder / one)
         found[key.replace("-", "_")] = one
@@ -67,7 +67,8 @@ def read_settings(folder: Path, kind: type[records.Record]) -> dict[str, Any]:
 
 
 def settings_text(options: records.Record, kind: type[records.Record], folder: Path) -> str:
-    """Return the file that states the options which are fields of `kind` and not the default.
+    """Return the content of a settings file with the options that differ from the defaults of
+    `kind`.
 
     Raises UsageError for a file outside the folder.
     """
@@ -81,17 +82,18 @@ def settings_text(options: records.Record, kind: type[records.Record], folder: P
             if not path.is_relative_to(resolve(folder)):
                 raise UsageError(f"--{key} {value} is outside {folder}", hint=OUTSIDE)
             value = path.relative_to(resolve(folder)).as_posix()
-        lines.append(f"{key} = {json.dumps(value)}\n")  # also TOML, of these types
+        lines.append(f"{key} = {json.dumps(value)}\n")  # for these types, JSON is valid TOML
     return "".join(lines)
 
 
 def with_settings(options: Options, folder: Path, kind: type[records.Record]) -> Options:
-    """Return the options with those of splinecli.toml in place of defaults. Raises InputError, or
-    UsageError if they conflict.
+    """Return the options with values from splinecli.toml instead of defaults.
+
+    Raises InputError, or UsageError if options conflict.
     """
     default = {field.name: field.default for field in fields(options)}
     given = {name for name in default if getattr(options, name) != default[name]}
-    for pair in options.CONFLICTS:  # an option that contradicts a given one does not apply
+    for pair in options.CONFLICTS:  # settings that conflict with a given option are ignored
         given |= set(pair[:2]) if given & set(pair[:2]) else set()
     taken = {
         name: value

@@ -1,6 +1,5 @@
-"""Detect captures once they are complete: folders of images, and videos.
-
-The frames of videos are extracted.
+"""Detect complete captures, which are folders of images or videos, and extract the frames of
+videos.
 """
 
 import json
@@ -24,7 +23,7 @@ from splinecli.system.files import is_folder, read_json
 from splinecli.system.progress import Observer
 from splinecli.system.publishing import held_folder, is_plain, new_files, refuse_link
 
-# the folder in the output folder of `infer` with a folder of frames for each video
+# Folder in the output folder of `infer` that contains a folder of frames for each video
 FOLDER = "frames"
 _RECORD = "film.json"
 _FRAME = re.compile(r"frame-\d{6,}\.png")
@@ -35,18 +34,18 @@ def unpacked(
 ) -> Path:
     """Return the capture or, for a video, the folder in `output` with its frames.
 
-    The frames are extracted if needed. `redo` decides whether the frames of an earlier video are
-    kept, replaced if the video differs, or extracted again. Raises UsageError if options are about
-    a light file, InputError if the video cannot be read, or its light does not move, or OutputError
-    if the folder contains frames from another video, or other files, or the frames cannot be
+    The frames are extracted if needed. `redo` decides whether existing frames are kept, replaced if
+    they come from another video, or extracted again. Raises UsageError if an option refers to a
+    light file, InputError if the video cannot be read or its light does not move, and OutputError
+    if the folder contains frames of another video or other files, or if the frames cannot be
     written.
     """
     if not is_film(capture):
         return capture
     if not (reading.finds_lights or reading.may_find_lights):
         raise UsageError(
-            f"{capture} is a video, whose lights have to be found",
-            hint="Leave out options about lights that are given",
+            f"{capture} is a video, whose lights have to be estimated",
+            hint="Leave out options about given lights",
         )
     folder, stamp = output / FOLDER / capture.stem, digest([stamp_content(capture)])
     refuse_link(folder.parent)
@@ -54,16 +53,16 @@ def unpacked(
     with held_folder(folder, observer.warn):
         earlier = _earlier(folder)
         of_film, sizes = earlier.sha256, earlier.frames
-        # Other files would be mistaken for photographs, or for a mask.
+        # Other files would be mistaken for photographs or for a mask.
         known = {*sizes, _RECORD}
         others = sorted(
             e.name for e in folder.iterdir() if e.name not in known and not e.name.startswith(".")
         )
         if others and (sizes or not all(map(_FRAME.fullmatch, others))):
             raise OutputError(
-                f"contains {others[0]}, which is not a frame of this video",
+                f"the folder contains {others[0]}, which is not a frame of this video",
                 path=folder,
-                hint="Move it, or choose another -o",
+                hint="Move the file, or choose another folder with -o",
             )
         whole = all(
             is_plain(folder / name) and (folder / name).stat().st_size == sizes[name]
@@ -73,9 +72,9 @@ def unpacked(
             return folder
         if of_film not in (stamp, "") and redo == "nothing":
             raise OutputError(
-                "contains the frames of another video, or of an earlier version of this one",
+                "the folder contains frames of another video, or of an earlier version of this one",
                 path=folder,
-                hint="Add --update to extract the frames of this video, or choose another place"
+                hint="Add --update to extract the frames of this video, or choose another folder"
                 " with -o",
             )
         with observer.progress(f"{capture.stem}: choosing frames", 1) as advance:
@@ -91,7 +90,7 @@ def unpacked(
 
 
 class _Film(Struct):
-    """The video of a folder of frames, and their sizes."""
+    """The video of a folder of frames, and the sizes of the frames."""
 
     film: str
     sha256: str
@@ -99,7 +98,9 @@ class _Film(Struct):
 
 
 def _earlier(folder: Path) -> _Film:
-    """Return the record of the video whose frames are in the folder; empty if there are none."""
+    """Return the record of the video whose frames are in the folder; an empty record if there are
+    none.
+    """
     with suppress(OSError, ValueError):
         record: _Film = read_json(folder / _RECORD, _Film)
         if len(record.frames) >= FEWEST_FRAMES and all(map(_FRAME.fullmatch, record.frames)):
@@ -107,21 +108,21 @@ def _earlier(folder: Path) -> _Film:
     return _Film("", "", {})
 
 
-# number of files, their bytes, and the newest time of a change in nanoseconds
+# number of files, their total size in bytes, and the time of the last change in nanoseconds
 Stamp = tuple[int, int, int]
-# Interval between checks of the files of a capture that was already returned. In between, only its
-# folders are checked: their times change when a file is added, removed or replaced, but not when
-# one is overwritten in place.
+# Interval between checks of all files of a capture that was already returned. In between, only its
+# folders are checked. Their times change when a file is added, removed or replaced, but not when it
+# is overwritten in place.
 SECONDS_BETWEEN_FILES = 60.0
 
 
 @dataclass
 class _Seen:
-    """The contents of a capture, when they last changed, and whether they were returned."""
+    """The contents of a capture, when they last changed, and whether the capture was returned."""
 
     stamp: Stamp
     since: float
-    # its folders, or the video, with their modification times in nanoseconds
+    # modification times of its folders, or of the video, in nanoseconds
     folders: dict[str, int]
     looked_at: float  # when the stamp was last compared with the files
     returned: bool = False
@@ -130,11 +131,11 @@ class _Seen:
 class Arrivals:
     """The complete captures in a folder (its subfolders and videos) that were not returned before.
 
-    A capture is complete when it contains a file named `marker`. Without a marker, and for videos,
-    it is complete when nothing in it has changed for `seconds`. Names that begin with a dot are
-    ignored, and so is `without`, such as the folder of the results, which must not be a capture or
-    be inside one. A capture that changes after it was returned is returned again; a file that is
-    overwritten in place is noticed within SECONDS_BETWEEN_FILES. `clock` is monotonic.
+    A capture is complete when it contains a file named `marker`. Videos, and all captures without a
+    marker, are complete when they have not changed for `seconds`. Names that begin with a dot are
+    ignored, and so is the folder `without`, such as the folder of the results, which must not be a
+    capture or be inside one. A capture that changes after it was returned is returned again; a file
+    that is overwritten in place is noticed within SECONDS_BETWEEN_FILES. `clock` is monotonic.
     """
 
     def __init__(
@@ -152,11 +153,11 @@ class Arrivals:
         self._seen: dict[Path, _Seen] = {}
 
     def take(self) -> list[Path]:
-        """Return the captures that became complete since the last call, sorted naturally by name.
+        """Return the captures that became complete since the last call, in natural order.
 
-        If the results of two captures have the same name, such as a folder and a video, the second
-        is returned by the next call. Raises InputError if the folder cannot be read; afterwards,
-        all its captures are returned again.
+        If the results of two captures would have the same name, as for a folder and a video, the
+        second is returned by the next call. Raises InputError if the folder cannot be read;
+        afterwards, all its captures are returned again.
         """
         captures, now = self._captures(), self._clock()
         self._seen = {path: self._seen[path] for path in captures if path in self._seen}
@@ -180,7 +181,7 @@ class Arrivals:
             by_time = self.marker is None or is_film(path)
             complete = unchanged if by_time else os.path.exists(path / str(self.marker))  # noqa: PTH110 - never raises
             name = path.name
-            with suppress(InputError):  # reading the capture will raise it again
+            with suppress(InputError):  # reading the capture raises it again
                 name = capture_name(path)
             seen.returned = complete and ready.setdefault(name, path) is path
         return sorted(ready.values(), key=natural_key)
@@ -190,7 +191,7 @@ class Arrivals:
             with os.scandir(self.folder) as entries:
                 visible = [Path(entry.path) for entry in entries if entry.name[0] != "."]
         except OSError as error:
-            self._seen.clear()  # a capture that was being read has failed and must be retried
+            self._seen.clear()  # a capture that was being read failed and must be retried
             raise InputError(
                 f"the folder cannot be read ({error.strerror})", path=self.folder
             ) from error

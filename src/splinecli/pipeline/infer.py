@@ -77,9 +77,9 @@ if TYPE_CHECKING:
     from splinecli.estimate.methods.distilled import DistilledEstimator
 
 
-# for Python, PyTorch and a batch of pixels; captures and their refinement need more
+# memory for Python, PyTorch and a batch of pixels, without the capture and its refinement
 BASE_BYTES = 500 * 2**20
-# most pixels refined at once (a tile with its margin); bytes per pixel
+# largest number of pixels refined at once (a tile with its margin), and bytes per pixel
 REFINED_PIXELS, REFINED_BYTES = (736**2, 1100)
 
 
@@ -92,8 +92,8 @@ _LIGHTS_CAPTION = (
     " errors"
 )
 
-# A network follows a tilt of its lights only in part, so that it is undone in steps, of which each
-# reduces the curl to the share or less.
+# If all lights are tilted, the network's normals are tilted by less, so the tilt is undone in
+# steps. Each step must reduce the curl to this share or less.
 _TILTS, _LEAST_FALL, _SMALL_TILT_DEG, _LEAST_CHANGE = 3, 0.95, 4.0, 0.03
 
 
@@ -101,7 +101,7 @@ def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
     """Return the memory in bytes that spline-net needs for a capture, in addition to BASE_BYTES.
 
     It follows from the size of the largest image, the number of pixels in the mask and the number
-    of images read.
+    of images.
     """
     of_indirect_light = 4 * n_pixels
     of_pixels = of_indirect_light + REFINED_BYTES * min(n_pixels, REFINED_PIXELS)
@@ -109,11 +109,11 @@ def infer_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
 
 
 def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) -> float:
-    """Return the approximate memory in bytes for a capture, from the first image's header and, if
-    large, the mask.
+    """Return the approximate memory in bytes for a capture; 0 if it cannot be read and so will
+    fail.
 
-    For a capture that cannot be read, the result is 0, because it will soon fail. `n_lights` images
-    are read; 0 reads all images.
+    It follows from the header of the first image and, for large captures, from the mask. `n_lights`
+    is the number of images that are used; 0 stands for all.
     """
     try:
         source = open_source()
@@ -121,7 +121,7 @@ def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) ->
         n_lights = n_lights or source.n_lights
         n_pixels = source.window.of(np.broadcast_to(np.True_, size[0][:2])).size
         n_bytes = infer_bytes(size, n_pixels, n_lights)
-        is_large = n_bytes > 10**9  # so that it is worth reading the mask
+        is_large = n_bytes > 10**9  # so reading the mask is worth the time
         if is_large and (source.files.mask is not None or source.files.boundaries):
             n_bytes = infer_bytes(
                 size, int(np.count_nonzero(source.read_mask(size[0][:2]))), n_lights
@@ -137,9 +137,9 @@ def distil_for(
     """Return a distilled estimator for a capture, or None to use `estimator` on every pixel; and
     warnings.
 
-    Under near lamps, the capture must contain its surface points. With `wanted` = None,
+    Under near lamps, the capture must contain its surface points. If `wanted` is None,
     AUTOMATIC_FROM decides. Raises UsageError if distillation is requested, but the method does not
-    estimate a confidence, or the capture is too small.
+    estimate a confidence or the capture is too small.
     """
 
     def refuse(problem: str) -> tuple[None, list[CaptureWarning]]:
@@ -152,7 +152,7 @@ def distil_for(
         return None, []
     if not estimator.has_confidence:
         return refuse(
-            f"method {estimator.name} does not provide confidence and cannot be distilled"
+            f"method {estimator.name} cannot be distilled, because it does not provide confidence"
         )
     sizes = student_sizes(capture.n_pixels)
     if sizes[0].sample < FEWEST_TO_DISTIL:
@@ -170,9 +170,9 @@ def distil_for(
         if distilled.distillation.is_good:
             return distilled, []
     text = (
-        "The full network estimated every pixel, because a smaller one, trained on a sample,"
-        f" deviated from it by {distilled.distillation.mean_deg:.1f} degrees. The full network"
-        f" expects errors of {distilled.distillation.expected_deg:.1f} degrees."
+        "The full network was applied to every pixel, because a smaller one, trained on a sample,"
+        f" deviated from it by {distilled.distillation.mean_deg:.1f} degrees. The predicted errors"
+        f" of the full network are {distilled.distillation.expected_deg:.1f} degrees."
     )
     return None, [CaptureWarning(NOT_DISTILLED, text)]
 
@@ -185,13 +185,14 @@ def estimate_capture(
     progress: Callable[[int], object] | None = None,
     clock: Clock | None = None,
 ) -> tuple[NormalEstimate, DistilledEstimator | None, Work]:
-    """Return the normals of a prepared capture, with all warnings added to it, the distilled
-    estimator if one was used, and the work after its clear faults were mended.
+    """Return the normals of a prepared capture, the distilled estimator if one was used, and the
+    work.
 
-    The capture is judged first, then `load` returns the estimator. `distil` is as in distil_for.
-    `progress` is called with the number of pixels just estimated. If the options of the recipe are
-    strict, a warning that an input is probably wrong becomes an InputError. The clock times the
-    stages and shows them.
+    The capture, with all warnings added to it, is part of the estimate; the work is returned after
+    its clear faults were mended. The capture is judged before `load` is called, which returns the
+    estimator. `distil` is as in distil_for. `progress` is called with the number of pixels just
+    estimated. If the options of the recipe are strict, a warning that an input is probably wrong
+    becomes an InputError. The clock times the stages and shows them.
     """
     clock = clock or Clock()
     clock.begin("check", note="checking")
@@ -225,7 +226,7 @@ def estimate_capture(
         CaptureWarning(UNTRAINED_LIGHTS, text)
         for text in estimator.warn_of_lights(capture.n_lights)
     ]
-    # The other warnings explain why the confidence is low.
+    # Other warnings about errors already explain a low confidence.
     if not any(warning.error_deg and warning.is_error for warning in warnings):
         warnings += check_confidence(estimate.expected_under_5)
     refuse_if_strict(warnings, capture.name, strict=strict, mended=mended)
@@ -236,11 +237,11 @@ def estimate_capture(
 def undo_tilt(
     estimate: NormalEstimate, again: Callable[[Capture], NormalEstimate], *, mends: bool
 ) -> tuple[NormalEstimate, list[CaptureWarning]]:
-    """Return the estimate under lights that are tilted back if the normals of a network show that
-    all lights are tilted, and warnings.
+    """Return the estimate, and warnings, after undoing a common tilt of all lights.
 
-    The lights are changed only if this reduces the curl of the new normals and does not increase
-    the errors that the network expects, and only if `mends`.
+    The tilt is found in the normals of a network. If `mends`, the lights are tilted back, provided
+    that this reduces the curl of the new normals and does not increase the errors that the network
+    predicts.
     """
     capture = estimate.capture
     others = tuple(each for each in capture.warnings if each.kind != LIGHTS_TILTED)
@@ -261,7 +262,7 @@ def undo_tilt(
         found = find_tilt(tried.normal_map, capture.mask)
         if found is None or found.curl > _LEAST_FALL * left.curl:
             break
-        # Under lights that were right, the network expects larger errors once they are tilted.
+        # Tilting correct lights increases the errors that the network predicts.
         if (tried.expected_under_5 or 0) < (estimate.expected_under_5 or 0) - _LEAST_CHANGE:
             if accepted is estimate:
                 return estimate, []
@@ -274,7 +275,7 @@ def undo_tilt(
         accepted = replace(accepted, capture=replace(accepted.capture, mended=codes))
         return accepted, [lights_mended(cause)]
     warning = CaptureWarning(LIGHTS_TILTED, f"{cause} {TILT_ADVICE}.", tilt.degrees)
-    # the confidence accounts for it
+    # With this warning, the confidence accounts for the tilt.
     return again(replace(capture, warnings=(*capture.warnings, warning))), [warning]
 
 
@@ -285,30 +286,27 @@ def infer_capture(
     *,
     load: Callable[[], Estimator] | None = None,
 ) -> dict[str, Any]:
-    """Estimate the normals of the capture in `folder` and return the report.
+    """Estimate the normals of the capture in `folder`, write the results and return the report.
 
-    The results are written to `options.output`/<capture name>/, replacing earlier ones as new_files
-    does. No other process may write there in the meantime.
+    The results in `options.output`/<capture name>/ replace earlier ones, as in new_files. No other
+    process may write there in the meantime.
 
     Args:
         load: returns `make_method(options)`, which can be reused in a batch to save time. It is
-            called once the capture has been read and checked.
+            called after the capture was read and checked.
 
     Raises:
         InputError: the capture cannot be read, or with options.strict, its lights or images are
             probably wrong.
         UsageError: the options do not fit the capture or the method.
         ModelError: the weights cannot be used.
-        OutputError: the results cannot be written, or another process writes into that folder
+        OutputError: the results cannot be written, or another process writes to the same folder
             (BusyError).
 
     Examples:
-        >>> from pathlib import Path
-        >>> from splinecli.pipeline.infer import infer_capture
-        >>> from splinecli.pipeline.infer_options import InferOptions
-        >>> options = InferOptions(method="ls", output="results")
-        >>> infer_capture(Path("examples/medallion"), options)["n_pixels"]
-        11836
+        >>> from pathlib import Path >>> from splinecli.pipeline.infer import infer_capture >>> from
+        splinecli.pipeline.infer_options import InferOptions >>> options = InferOptions(method="ls",
+        output="results") >>> infer_capture(Path("examples/medallion"), options)["n_pixels"] 11836
     """
     name = capture_name(folder)
     with held_results(name, options, observer) as target, observer.progress(name, 1.0) as show:
@@ -323,7 +321,7 @@ def infer_capture(
         estimate, distilled, work = estimate_capture(work, load, distil=options.distil, clock=clock)
         source, capture = work.files, work.made
         for warning in estimate.capture.warnings:
-            # usual in a batch, and of all its captures
+            # In a batch, this warning usually applies to all captures.
             once = warning.text if warning.kind is EIGHT_BIT else None
             observer.warn(f"{capture.name}: {warning}", once=once)
         estimator = load()
@@ -349,10 +347,9 @@ def infer_capture(
 
 
 def inputs_sha256(source: CaptureSource, weights: str | None, *, loaded: str | None = None) -> str:
-    """Return a digest that changes if the weight file or any file that is read for the capture
-    changes.
+    """Return a digest that changes whenever the weight file or a file of the capture changes.
 
-    `loaded` is the SHA-256 of the weight file at the time it was loaded; with None, the file is
+    `loaded` is the SHA-256 of the weight file at the time it was loaded. If it is None, the file is
     read.
     """
     if weights is not None and (path := expanded(weights)).is_file():
@@ -362,7 +359,7 @@ def inputs_sha256(source: CaptureSource, weights: str | None, *, loaded: str | N
 
 @contextmanager
 def held_results(name: str, options: InferOptions, observer: Observer) -> Iterator[Path]:
-    """Lock the folder for the results of a capture with held_folder, and yield it. Raises
+    """Yield the folder for the results of a capture, locked with held_folder. Raises
     OutputError.
     """
     target = Path(options.output) / name
@@ -374,12 +371,14 @@ def held_results(name: str, options: InferOptions, observer: Observer) -> Iterat
 def make_method(options: InferOptions) -> Estimator:
     """Return the estimator selected by the options. Loading a network takes about a second.
 
-    Raises UsageError if the options require weights or a confidence that the method does not have,
-    or ModelError.
+    Raises ModelError, or UsageError if the options require weights or a confidence that the method
+    does not have.
     """
     estimator = make_estimator(options.method, options.method_options)
     if options.weights is not None and estimator.weights is None:
-        raise UsageError(f"method {options.method} uses no weights", hint="Leave --weights out")
+        raise UsageError(
+            f"method {options.method} does not use weights", hint="Leave --weights out"
+        )
     for name in options.maps:
         if MAPS[name].needs_confidence and not estimator.has_confidence:
             raise UsageError(
@@ -390,9 +389,10 @@ def make_method(options: InferOptions) -> Estimator:
 
 
 def loads_first(options: InferOptions) -> bool:
-    """Return whether the method has to be loaded before a capture is read.
+    """Return whether the method has to be loaded before a capture is read, because an option may be
+    invalid.
 
-    Its options may be wrong, except for the precision.
+    The precision is always valid.
     """
     chosen = replace(options.method_options, precision="auto") != MethodOptions()
     return chosen or options.method != DEFAULT_METHOD
@@ -423,8 +423,8 @@ def _prepare(source: CaptureSource, options: InferOptions, clock: Clock) -> Work
 
 
 def _check_results(capture: Capture, folder: Path, options: InferOptions) -> None:
-    """Raise InputError, before hours of work, if the results exceed the free memory or the mesh
-    would be empty.
+    """Raise InputError, before hours of work, if the results need too much memory or a mesh is
+    empty.
     """
     rows = chosen_maps(options.maps, page=options.html)
     for row in rows:
@@ -441,16 +441,15 @@ def _check_results(capture: Capture, folder: Path, options: InferOptions) -> Non
 
 
 def _check_light_files(target: Path) -> None:
-    """Raise OutputError if the folder of results contains a light file that was not written by an
-    earlier run.
-    """
+    """Raise OutputError if the folder of results contains a light file from another source."""
     own = files.own_light_files(target)
     for name in FOUND_LIGHTS:
         if (target / name).exists() and name not in own:
             problem = (
-                "the file is not from an earlier run, and --lights estimate would overwrite it"
+                "--lights estimate would overwrite this file, which was not written by an earlier"
+                " run"
             )
-            raise OutputError(problem, path=target / name, hint="Choose another -o")
+            raise OutputError(problem, path=target / name, hint="Choose another folder with -o")
 
 
 def _make_files(
@@ -461,9 +460,7 @@ def _make_files(
     observer: Observer,
     clock: Clock,
 ) -> list[Iterable[tuple[str, Content]]]:
-    """Compute the results that the options request, add the surface to the report, and return the
-    files.
-    """
+    """Compute the requested results, add the surface to the report, and return the files."""
     capture = estimate.capture
     clock.begin("pictures", note="maps")
     made = _costly_maps(source, estimate, options, clock)
@@ -525,8 +522,9 @@ def _make_files(
 def _costly_maps(
     source: CaptureSource, estimate: NormalEstimate, options: InferOptions, clock: Clock
 ) -> dict[str, Float32Array]:
-    """Return the maps that need a lot of memory or are on the page; the others are computed when
-    they are written.
+    """Return the maps that need much memory or are shown on the page.
+
+    The others are computed when they are written.
     """
     made: dict[str, Float32Array] = {}
     for row in chosen_maps(options.maps, page=options.html):
@@ -545,7 +543,7 @@ def _costly_maps(
 def _textures(made: Mapping[str, Float32Array], mask: Bools) -> Textures:
     """Return the textures of a mesh from the maps that were made."""
     if (material := made.get("material")) is not None:
-        return Textures(  # highlights are not part of the base colour
+        return Textures(  # the base colour excludes highlights
             base_colour_picture(material[..., :3], mask),
             gloss_picture(material[..., 3:5], mask),
             material[..., 5],
@@ -558,10 +556,8 @@ def _textures(made: Mapping[str, Float32Array], mask: Bools) -> Textures:
 def results_bytes(
     n_pixels: int, n_lights: int, *, maps: Sequence[str] = (), surface: bool = False
 ) -> int:
-    """Return the memory in bytes that `infer` needs for a capture's results, in addition to its
-    observations.
-    """
-    # The memory of one map is freed before the next is computed.
+    """Return the memory in bytes for a capture's results, in addition to its observations."""
+    # The memory of each map is freed before the next one is computed.
     each = [
         MAPS[name].bytes_per_pixel + MAPS[name].bytes_per_observation * n_lights for name in maps
     ]

@@ -1,9 +1,8 @@
-"""The options of `infer`, `watch` and `info` as frozen records.
-
-They can be pickled and converted to JSON.
+"""The options of `infer`, `watch` and `info` as frozen records, which can be pickled and converted
+to JSON.
 """
 
-# The options form a table: name and type, then panel, help text and kind of value.
+# Each option has a name and a type, then its panel, its help text and the kind of its value.
 from __future__ import annotations
 
 import dataclasses
@@ -63,11 +62,8 @@ SMALLEST_PIXEL_MM, LARGEST_PIXEL_MM = 1e-6, 1e6
 
 
 def complete_weights() -> list[str]:
-    """Return the names of the shipped weights.
-
-    If none starts with the typed text, the shell completes file names.
-    """
-    # The module that usually reads this file imports torch, which is too slow for shell completion.
+    """Return the names of the shipped weights, or none if the shell should complete file names."""
+    # The module that normally reads this file imports torch, which is too slow for completion.
     return list(
         json.loads((resources.files("splinecli") / "assets/weights.json").read_text("utf-8"))
     )
@@ -138,7 +134,7 @@ Update = Annotated[
 
 
 class Display(Record, frozen=True, kw_only=True):
-    """The output that a command prints."""
+    """What a command prints."""
 
     as_json: bool = flag(
         "Output", "Print one JSON document on stdout, and nothing else.", names="--json"
@@ -147,16 +143,15 @@ class Display(Record, frozen=True, kw_only=True):
 
 
 def parse_workers(text: str) -> int:
-    """Return the number of processes, with 0 for "auto". Raises UsageError."""
+    """Return the number of processes, which is 0 for "auto". Raises UsageError."""
     if text != "auto" and (not text.isdecimal() or len(text) > 4 or int(text) < 1):
         raise UsageError(f"--workers is {text!r}; expected a number of at least 1, or auto")
     return 0 if text == "auto" else int(text)
 
 
 class WorkerOptions(Record, frozen=True, kw_only=True):
-    """The number of local processes for the items of a command.
-
-    0 means as many as the machine can use.
+    """The number of local processes for the items of a command; 0 uses as many as the machine can
+    run.
     """
 
     workers: int = option(
@@ -170,9 +165,11 @@ class WorkerOptions(Record, frozen=True, kw_only=True):
 
 
 class ClusterOptions(WorkerOptions, frozen=True, kw_only=True):
-    """Where the items of a command are processed: here, in other processes, or on a cluster."""
+    """Where the items of a command are processed: in this process, in other processes or on a
+    cluster.
+    """
 
-    # the address or the scheduler file of a Dask scheduler
+    # address or scheduler file of a Dask scheduler
     address: str | None = option(
         "Processes and machines",
         "Compute on a running Dask cluster: the address of its scheduler, or its scheduler file"
@@ -182,12 +179,12 @@ class ClusterOptions(WorkerOptions, frozen=True, kw_only=True):
     )
     gpu: bool = False  # whether only workers with the Dask resource GPU are used
 
-    CONFLICTS = (("workers", "address", "Leave --workers out: the cluster has workers of its own"),)
+    CONFLICTS = (("workers", "address", "Leave --workers out, as the cluster has its own workers"),)
 
     def on_cores(self, n_items: int | None = None) -> ClusterOptions | None:
-        """Return these options with one process per core instead of 0, at most one per item.
+        """Return these options with one process per core instead of 0, and at most one per item.
 
-        Return None if other processes would not be faster than this one.
+        None if other processes would not be faster than this one.
         """
         if self.address is not None:
             return self
@@ -201,9 +198,10 @@ HERE = ClusterOptions()
 
 
 class ReadingOptions(Record, frozen=True, kw_only=True):
-    """The options of `infer` and `info` that select the files of a capture and how to read them.
+    """The options of `infer` and `info` that select the files of a capture and how they are read.
 
-    The help describes each option. None stands for the default given there. Raises UsageError.
+    Each option is described in the help. None stands for the default given there. Raises
+    UsageError.
     """
 
     mask: FileName | None = option(
@@ -316,7 +314,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
         "Output",
         "Fail with exit code 3 if the lights or the images are probably wrong, instead of warning.",
     )
-    # whether a surface, in the unit of pixel_size, is also computed; a field of InferOptions
+    # whether a surface in the unit of pixel_size is computed, too; a field of InferOptions
     surface = False
 
     CONFLICTS: ClassVar[records.Conflicts] = (("lights_in_channels", "align", LEAVE_ONE),)
@@ -324,7 +322,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         # These options apply to near lamps or to a light file.
-        near, of_file = "finds distant lights", "needs no light file"
+        near, of_file = "finds distant lights", "does not use a light file"
         for name, given, reason in (
             ("--light-positions", self.light_positions is not None, near),
             ("--light-distance", self.light_distance is not None, near),
@@ -334,11 +332,12 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
             if self.finds_lights and given:
                 raise UsageError(
                     f"--lights estimate {reason}, so it cannot be used with {name}",
-                    hint=f"Leave {name} out, or give a light file",
+                    hint=f"Leave {name} out, or pass a light file",
                 )
-        add_it = "Add it, or leave both out"
+        add_it = "Add {}, or leave both out"
         if self.crosstalk is not None and not self.lights_in_channels:
-            raise UsageError("--crosstalk needs --lights-in-channels", hint=add_it)
+            hint = add_it.format("--lights-in-channels")
+            raise UsageError("--crosstalk needs --lights-in-channels", hint=hint)
         if self.align and self.scale is not None:
             raise UsageError(
                 "--align needs every row and column, so it cannot be used with --scale",
@@ -346,7 +345,8 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
             )
         if self.first_light is not None:
             if not (self.finds_lights or self.may_find_lights):
-                raise UsageError("--first-light needs --lights estimate", hint=add_it)
+                hint = add_it.format("--lights estimate")
+                raise UsageError("--first-light needs --lights estimate", hint=hint)
             azimuth_of(self.first_light)
         _ = self.lamps, parse_window(self.crop, self.scale), parse_transfer(self.transfer)
         if "exchanged" in (self.light_frame or ""):  # its name in earlier versions
@@ -360,7 +360,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
 
     @property
     def light_file(self) -> str | None:
-        """The light file that overrides the capture's own."""
+        """The light file that replaces the capture's own."""
         return None if self.finds_lights else self.lights
 
     @property
@@ -376,7 +376,9 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
         )
 
     def check_files(self) -> None:
-        """Raise InputError if a file is missing, or the folder of --flat-field has no images."""
+        """Raise InputError if a file is missing, or if the folder of --flat-field contains no
+        images.
+        """
         intensities = None if self.intensities == EQUAL else self.intensities
         for name in (
             *(self.light_file, self.light_positions, intensities, self.camera_matrix),
@@ -411,8 +413,9 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
 
     @property
     def may_find_lights(self) -> bool:
-        """Whether the lights are estimated if the capture has none: no option is about lights that
-        are given, or strict.
+        """Whether the lights are estimated if the capture has none.
+
+        They are not if an option refers to given lights, or with --strict.
         """
         about_lights = (
             self.lights,
@@ -425,8 +428,10 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
         return self.light_format == "xyz" and all(each is None for each in about_lights)
 
     def open(self, folder: Path) -> CaptureSource:
-        """Open the capture in the folder with these options; its lights remain to be estimated if
-        it has none. Raises InputError, or UsageError for a first light of lights that are given.
+        """Open the capture in the folder with these options.
+
+        If the capture has no lights, they remain to be estimated. Raises InputError, or UsageError
+        if a first light is given although the lights are given.
         """
         try:
             source = self._open(folder, needs_lights=not self.finds_lights)
@@ -438,9 +443,8 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
                 raise
         if source.has_lights and self.first_light is not None:
             raise UsageError(
-                f"--first-light is about lights that are estimated, and {source.name} has a light"
-                " file",
-                hint="Add --lights estimate, or leave it out",
+                f"--first-light applies to estimated lights, but {source.name} has a light file",
+                hint="Add --lights estimate, or leave --first-light out",
             )
         taken = [
             f"{name.replace('_', '-')} = {value}"
@@ -453,7 +457,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
         return source
 
     def with_settings(self, folder: Path) -> Self:
-        """Return these options, with those of splinecli.toml in the folder instead of defaults.
+        """Return these options, with values from splinecli.toml in the folder instead of defaults.
 
         Raises InputError, or UsageError if options conflict.
         """
@@ -484,7 +488,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
 
 
 class FolderSettings(ReadingOptions, frozen=True, kw_only=True):
-    """What splinecli.toml in the folder of a capture may state: no outputs and methods."""
+    """The options that splinecli.toml in a capture's folder may contain: no outputs and methods."""
 
     auto_mask: AutoMask = False
 
@@ -507,8 +511,8 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
     Raises UsageError if a value is invalid or two options conflict.
     """
 
-    # The defaults follow. light_indices are zero-based. map_scales are names of maps and the values
-    # shown as white, if they are not those of the rows in MAPS.
+    # light_indices are zero-based. map_scales contains names of maps with the values shown as
+    # white, if they differ from MAPS.
     auto_mask: AutoMask = False
     as_stored: AsStored = False
     refine_lights: RefineLights = False
@@ -606,8 +610,9 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
 
     @classmethod
     def from_arguments(cls, given: dict[str, Any]) -> Self:
-        """See Record. --maps also sets scales, and the seed only applies if the lights are drawn at
-        random.
+        """Return the options for arguments from the command line; see Record.
+
+        --maps also sets scales, and the seed is kept only if the lights are drawn at random.
         """
         scales = []
         if given["maps"] is not None:
@@ -618,7 +623,7 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
                 names.append(name)
                 if colon and (name not in scaled or not 0 < (to_number(scale) or 0) < math.inf):
                     expected = " or ".join(f"{name}:NUMBER" for name in scaled)
-                    problem = f"--maps has {item.strip()!r}; a scale is given as {expected}"
+                    problem = f"--maps contains {item.strip()!r}; expected a scale as in {expected}"
                     raise UsageError(f"{problem}, above 0")
                 scales += [(name, float(scale))] if colon else []
             given["maps"] = ",".join(names)
@@ -627,7 +632,10 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
         return super().from_arguments(given).replace(map_scales=tuple(scales))
 
     def changes(self, earlier: InferOptions) -> list[str]:
-        """Return the options that affect the results, which excludes --output and --device."""
+        """Return the options whose values affect the results and differ from earlier options.
+
+        --output and --device do not affect the results.
+        """
         found = {}
         for name, kind in records.field_types(type(self)).items():
             if name not in ("output", "device") and getattr(self, name) != getattr(earlier, name):
@@ -655,16 +663,15 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
         return MethodOptions(self.weights, device=self.device, precision=self.precision)
 
     def check_files(self) -> None:
-        """See ReadingOptions.
-
-        Also raise UsageError if a package required by the options is not installed.
+        """Raise the errors of ReadingOptions, and UsageError if a required package is not
+        installed.
         """
         super().check_files()
         check_exr(self.formats)
 
 
 def check_pixel_size(pixel_size: float) -> None:
-    """Raise UsageError if a pixel size (mm) is out of range for a surface."""
+    """Raise UsageError if a pixel size in millimetres is out of range for a surface."""
     if not SMALLEST_PIXEL_MM <= pixel_size <= LARGEST_PIXEL_MM:
         expected = f"{SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g}"
         raise UsageError(f"the pixel size is {pixel_size:g} mm, expected {expected}")
@@ -688,13 +695,13 @@ class Shard(NamedTuple):
         if not 1 <= number <= count:
             raise UsageError(
                 f"--shard is {number}/{count}; expected I/N with I from 1 to N",
-                hint="If your job numbers count from 0, add 1",
+                hint="If your job numbers start at 0, add 1",
             )
         return cls(number, count)
 
 
 class BatchOptions(Record, frozen=True, kw_only=True):
-    """The captures of `infer`, what is computed again, and the printed output."""
+    """The captures of `infer`, which of them are computed again, and what is printed."""
 
     captures: tuple[Path, ...] = option(
         "Arguments",

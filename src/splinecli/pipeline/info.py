@@ -1,4 +1,6 @@
-"""Report on a capture: the data that `infer` would read, and the resources that it would need."""
+"""Report on a capture: the data that `infer` would read, and the time and memory that it would
+need.
+"""
 
 from dataclasses import replace
 from importlib import resources
@@ -28,7 +30,7 @@ from splinecli.records.output_files import CAPTURE_SHEET
 from splinecli.system.files import check_free, file_sha256, write_bytes
 from splinecli.system.progress import SILENT, Observer
 
-# The sources of a white level, as human-readable text.
+# Descriptions of the sources of a white level
 ORIGINS = {
     "given": "given by --white-level",
     "file": "stated by the image files",
@@ -40,12 +42,11 @@ ORIGINS = {
 def describe_capture(
     options: InfoOptions, reading: ReadingOptions | None = None, observer: Observer = SILENT
 ) -> dict[str, Any]:
-    """Read a capture without estimating normals, write the plot and the corrected lights, and
-    return the report.
+    """Read a capture without estimating normals, write the requested files and return the report.
 
-    `reading` is how `infer` would read the capture; if it is strict, skipped checks are also
-    warnings. Raises InputError, OutputError, or UsageError if the plot would be in the folder of
-    the images, or options cannot be used together.
+    `reading` contains the options with which `infer` would read the capture; if it is strict,
+    skipped checks are also reported as warnings. Raises InputError, OutputError, or UsageError if
+    the plot would be in the folder of the images, or if options cannot be used together.
     """
     reading, plot, mended_lights = reading or ReadingOptions(), options.plot, options.mended_lights
     with TemporaryDirectory() as frames:  # extracted from a video
@@ -111,7 +112,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
     )
     lights += f", {angles} degrees from the camera axis"
     intensities = (
-        report["light_intensities"] or "none: equal, or estimated where equal ones do not fit"
+        report["light_intensities"] or "none: equal, or estimated if equal ones do not fit"
     )
     if estimated is not None and estimated["intensities"] is not None:
         intensities = "estimated from the images"
@@ -146,7 +147,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         ("weights", f"spline-net, SHA-256 {report['weights']['spline-net'][:16]}..."),
     ]
     if "mended_lights" in report:
-        nothing = "not written: no other reading of the lights fits clearly better"
+        nothing = "not written, because no other reading of the lights fits clearly better"
         rows.append(("mended", report["mended_lights"] or nothing))
     return [f"{name:13}{text}" for name, text in rows] + _candidate_lines(
         report.get("light_candidates")
@@ -154,7 +155,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
 
 
 def _camera_in_words(report: dict[str, Any]) -> str | None:
-    """Return a human-readable description of the camera, or None if nothing is known about it."""
+    """Return a description of the camera; None if nothing is known about it."""
     matrix, of_exif = report["camera_matrix"], report["exif_camera_matrix"]
     if matrix is not None:
         return f"perspective, focal length {matrix[0][0]:.6g} pixels"
@@ -165,7 +166,7 @@ def _camera_in_words(report: dict[str, Any]) -> str | None:
 
 
 def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
-    """Return the table of interpretations of the light file; empty unless it was requested."""
+    """Return a table of interpretations of the light file; empty unless it was requested."""
     if not candidates:
         return []
     width = max(30, *(len(row["reading"]) + 2 for row in candidates))
@@ -183,25 +184,28 @@ def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
     return [
         *lines,
         "misfit: residual of the images, relative to lights in random order; it judges orders",
-        "advantage: evidence from curl and outline, against the file as given; from 1 on it gives"
-        " a warning",
+        "advantage: evidence from curl and outline against the file as given; from 1 on, a warning"
+        " is given",
     ]
 
 
 def _write_settings(options: InfoOptions, reading: ReadingOptions, folder: Path) -> None:
     """Write splinecli.toml into the folder of a capture.
 
-    Raises UsageError if no option is given, one names a file outside the folder, or the capture is
-    a video; OutputError if another file is there.
+    Raises UsageError if no option is given, an option names a file outside the folder, or the
+    capture is a video; OutputError if the folder contains another splinecli.toml.
     """
     if folder != options.capture:
-        raise UsageError("--write-settings needs a folder, not a video", hint="Leave it out")
+        raise UsageError(
+            "--write-settings needs a folder, not a video", hint="Leave --write-settings out"
+        )
     given = {name: getattr(reading, name) for name in reading.__struct_fields__}
     settings = FolderSettings(**given, auto_mask=options.auto_mask)
     text = settings_text(settings, FolderSettings, folder)
     if not text:
         raise UsageError(
-            "--write-settings needs options to write", hint="Add them, or leave it out"
+            "--write-settings needs options to write",
+            hint="Add options for reading the capture, or leave --write-settings out",
         )
     path = folder / SETTINGS
     if not (path.is_file() and path.read_text("utf-8") == text):
@@ -210,8 +214,8 @@ def _write_settings(options: InfoOptions, reading: ReadingOptions, folder: Path)
 
 
 def _check_options(options: InfoOptions, source: CaptureSource) -> None:
-    """Raise UsageError or OutputError, before the images are read, if there is no light file to
-    check, or a file cannot be written.
+    """Raise UsageError or OutputError, before reading images, if a file is missing or cannot be
+    written.
     """
     plot, mended_lights = options.plot, options.mended_lights
     for name, given in (
@@ -220,16 +224,13 @@ def _check_options(options: InfoOptions, source: CaptureSource) -> None:
     ):
         if given and not source.has_lights:
             raise UsageError(
-                f"{name} checks a light file, and the lights are estimated without one",
-                hint="Give --lights FILE, or leave it out",
+                f"{name} needs a light file, but the lights are estimated",
+                hint=f"Add --lights FILE, or leave {name} out",
             )
     if plot is not None:
         if plot.absolute().parent in {path.absolute().parent for path in source.files.images}:
-            problem = (
-                f"the plot {plot} would be in the folder of the images and be read as an image of"
-                " the capture"
-            )
-            raise UsageError(problem, hint="Choose another folder for it")
+            problem = f"the plot {plot} would be read as an image of the capture in this folder"
+            raise UsageError(problem, hint="Choose another folder for the plot")
         check_free(plot.parent, [plot.name], overwrite=options.overwrite)
     if options.output is not None:
         folder = Path(options.output) / source.name
@@ -280,7 +281,7 @@ def _report(work: Work, n_reads: int) -> dict[str, Any]:
     return {
         "capture": files.name,
         "layout": files.layout,
-        # each is there for every channel that is a light
+        # with lights in channels, each image is listed for every channel
         "images": len({image.path for image in images}),
         "first_image": images[0].path.name,
         "last_image": images[-1].path.name,

@@ -1,4 +1,4 @@
-"""Integrate normal maps: compute the surface, as `infer` also does, and write its files."""
+"""Integrate normal maps: compute the surface, as `infer --surface` does, and write its files."""
 
 import json
 import math
@@ -55,20 +55,20 @@ def view_of_report(
 ) -> tuple[Float64Array | None, float | None]:
     """Return the camera matrix and the pixel size in millimetres from a report of `infer`.
 
-    `camera_matrix` and `pixel_size_mm` refer to the photographs and override the values in the
-    report. Raises KeyError, TypeError, ValueError or UsageError if the document is not a report
+    `camera_matrix` and `pixel_size_mm` refer to the whole photographs and override the values in
+    the report. Raises KeyError, TypeError, ValueError or UsageError if the document is not a report
     from this version of `infer`.
     """
     options, lamps = report["options"], report["near_lamps"]
     window = parse_window(options["crop"], options["scale"])
     matrix = None if camera_matrix is None else window.camera(camera_matrix)
-    seen = report.get("camera_matrix")  # reports of earlier versions lack it
+    # The matrices in a report refer to the window. Earlier versions have none for distant lights.
+    stored = report.get("camera_matrix")
     if lamps is not None and lamps["camera"] == "perspective":
-        seen = lamps["camera_matrix"]
-    if matrix is None and seen is not None:
-        # of the part of the image that the window covers
-        matrix = np.array(seen, np.float64).reshape(3, 3)
-    # Without a surface, the pixel size only scaled near lamps, which may be in any unit.
+        stored = lamps["camera_matrix"]
+    if matrix is None and stored is not None:
+        matrix = np.array(stored, np.float64).reshape(3, 3)
+    # Without a surface, the pixel size applies only to near lamps and may be in any unit.
     if pixel_size_mm is None and options["surface"] and options["pixel_size"] is not None:
         pixel_size_mm = float(options["pixel_size"])
     if pixel_size_mm is not None:
@@ -158,7 +158,7 @@ def _integrate_into(options: IntegrateOptions, observer: Observer) -> dict[str, 
 def _read_textures(
     options: IntegrateOptions, shape: tuple[int, ...]
 ) -> tuple[Path | None, Textures]:
-    """Return the image of the colours, if any, and the textures (H, W).
+    """Return the image of the colours, if any, and the textures (H, W) for the mesh.
 
     They come from the options, or from the maps in the folder.
     """
@@ -177,22 +177,21 @@ def _read_textures(
     if options.colours is not None or not has_material:
         return picture, Textures(colours)
     stored = np.nan_to_num(read_depth(specular, ExpectedSize(shape, "the normal map", "a map")))
-    # up to full reflection
+    # limited to full reflection
     reflection = stored.clip(0, 12.5).astype(np.float32)
     return picture, Textures(colours, _read_picture(gloss, shape), reflection)
 
 
 def _read_picture(path: Path, shape: tuple[int, ...]) -> Picture:
-    """Return an image as a picture (H, W, 3) of 8 bits.
-
-    Raises InputError if its size is not (H, W).
+    """Return an image as an 8-bit picture (H, W, 3). Raises InputError if its size is not (H,
+    W).
     """
     image = np.broadcast_to(read_image(path, ExpectedSize(shape, "the normal map")), (*shape, 3))
     return np.asarray(np.rint(255 * image.clip(0, 1)), np.uint8)
 
 
 def summary_line(options: IntegrateOptions, report: dict[str, Any]) -> str:
-    """Return a one-line summary of the files that were written."""
+    """Return a one-line summary of the surface."""
     units = {"pixel": "pixels", "mean depth": "times the mean depth", "millimetre": "mm"}
     low, high = report["range"]
     extent = f"from {low:.4g} to {high:.4g} {units[report['unit']]}"
@@ -201,15 +200,14 @@ def summary_line(options: IntegrateOptions, report: dict[str, Any]) -> str:
 
 
 class _Listing(Struct):
-    """The part of a report that lists its files."""
+    """The list of files in a report."""
 
     files: list[str]
 
 
 def _earlier_files(folder: Path) -> list[str]:
-    """Return the surface files that an earlier `integrate` wrote to the folder.
-
-    Files from `infer` are kept.
+    """Return the surface files that an earlier `integrate` wrote to the folder, excluding those of
+    `infer`.
     """
     try:
         named = read_json(folder / SURFACE_REPORT, _Listing).files
@@ -219,7 +217,7 @@ def _earlier_files(folder: Path) -> list[str]:
 
 
 def _find_normal_map(folder: Path) -> Path:
-    names = [NORMALS[name] for name in ("npy", "tiff", "png", "png8")]  # exact ones first
+    names = [NORMALS[name] for name in ("npy", "tiff", "png", "png8")]  # the most precise first
     try:
         files = read_report(folder)["files"]
         return folder / next(name for name in names if name in files)
@@ -230,12 +228,12 @@ def _find_normal_map(folder: Path) -> Path:
     except UNUSABLE:
         problem = f"the folder has no complete results of infer: its {REPORT} is damaged"
     raise InputError(
-        problem, path=folder, hint="Give a folder that 'splinecli infer' wrote, or one of its files"
+        problem, path=folder, hint="Pass a folder written by 'splinecli infer', or one of its files"
     )
 
 
 def _report_of(path: Path) -> dict[str, Any] | None:
-    """Return the report of the run that wrote a normal map, or None without one."""
+    """Return the report of the run that wrote a normal map; None if there is none."""
     try:
         report: dict[str, Any] = read_json(path.parent / REPORT)
         if path.name not in report["files"]:
@@ -250,9 +248,9 @@ def _report_of(path: Path) -> dict[str, Any] | None:
         is_finite = 0 <= float(used["discontinuity"]) < math.inf
         if is_finite and used["convention"] in get_args(Convention):
             return report
-    problem = "is damaged, or from another version: it does not state how the normal map beside it"
     raise InputError(
-        f"{problem} was made",
+        "the report is damaged, or from another version, so it is unknown how the normal map in"
+        " this folder was made",
         path=path.parent / REPORT,
         hint="Run 'splinecli infer' again, or move the normal map to another folder",
     )

@@ -1,9 +1,8 @@
-"""The options of the commands that are not for individual captures, as frozen records.
-
-See their help.
+"""The options of the commands other than `infer`, `watch` and `info` as frozen records. See their
+help.
 """
 
-# The options form a table: name and type, then panel, help text and kind of value.
+# Each option has a name and a type, then its panel, its help text and the kind of its value.
 from __future__ import annotations
 
 from contextlib import suppress
@@ -41,7 +40,7 @@ from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.surface_files import DEFAULT_FORMATS
 
 DEFAULT_TRIALS = 100
-TRIALS_OF_MANY, MANY_METHODS = 10, 4  # 900 trials of all methods on one capture took hours
+TRIALS_OF_MANY, MANY_METHODS = 10, 4  # fewer trials, because 900 on one capture would take hours
 DEFAULT_LIGHTS = 10
 
 
@@ -122,11 +121,11 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
         if parse_transfer(self.transfer) != 1 and not (self.gray_ball or self.gray_card):
             raise UsageError(
                 "--transfer needs --gray-ball or --gray-card",
-                hint="Leave it out: the light directions do not depend on the curve",
+                hint="Leave --transfer out, because light directions do not depend on the curve",
             )
         if self.ball_diameter is not None and len(self.balls) < 2:
-            hint = "Photograph a second ball, or the same ball at another place: one ball gives no"
-            raise UsageError("--ball-diameter needs two balls or more", hint=f"{hint} positions")
+            hint = "Photograph a second ball, or the same ball at another place"
+            raise UsageError("--ball-diameter needs at least two balls", hint=hint)
         if self.lights_in_channels and not self.gray_ball:
             raise UsageError(
                 "--lights-in-channels needs --gray-ball",
@@ -143,7 +142,7 @@ class CalibrateOptions(Display, frozen=True, kw_only=True):
 
 
 def parse_level(text: str) -> tuple[tuple[int, int], ...]:
-    """Return the points in a text such as "10,20 90,20 50,80", or () for "plane".
+    """Return the points in a text such as "10,20 90,20 50,80", or an empty tuple for "plane".
 
     Raises UsageError.
     """
@@ -316,8 +315,8 @@ def parse_pixel(text: str) -> tuple[int, int]:
 class EvaluateOptions(Display, frozen=True, kw_only=True):
     """The options of `evaluate`.
 
-    The method "all" stands for all methods. None among the numbers of lights stands for all lights.
-    Without any number, DEFAULT_LIGHTS is used, or the number in the draws file.
+    The method "all" stands for all methods. Among the numbers of lights, None stands for all
+    lights. If no number is given, DEFAULT_LIGHTS or the number in the draws file is used.
     """
 
     datasets: tuple[Path, ...] = option(
@@ -425,18 +424,18 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
         if self.lights not in (None, ESTIMATE):
             raise UsageError(
                 f"--lights is {self.lights}; expected {ESTIMATE}",
-                hint="Without it, the light files of the captures are used",
+                hint="Without --lights, the light files of the captures are used",
             )
         if self.lights is not None and (self.refine_lights or any(self.light_noise_deg)):
             raise UsageError(
-                "--lights estimate uses no light file, so it cannot be used with --refine-lights or"
-                " --light-noise-deg",
-                hint="Leave these out",
+                "--lights estimate does not use a light file, so it cannot be used with"
+                " --refine-lights or --light-noise-deg",
+                hint="Leave these options out",
             )
         if self.cluster != HERE and self.jobs is not None:
             raise UsageError(
                 "--jobs cannot be used with --workers or --cluster",
-                hint="Leave it out: a worker scores one trial at a time",
+                hint="Leave --jobs out, because a worker scores one trial at a time",
             )
         for name in self.names:
             check_method(name)
@@ -462,7 +461,7 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
 
     @property
     def protocols(self) -> list[Protocol]:
-        """One protocol for each combination of number of lights and light noise.
+        """One protocol for each combination of the number of lights and the light noise.
 
         Raises UsageError.
         """
