@@ -171,7 +171,7 @@ def test_an_option_is_not_the_value_of_the_one_before(option, capture, run):
     run(
         f"infer {capture} --lights-in-channels {option} --strict",
         code=2,
-        says=f"{option} needs a file or folder, found --strict. Give it after the option.",
+        says=f"{option} needs a file or folder, found --strict. Write the file or folder after",
     )
 
 

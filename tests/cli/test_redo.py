@@ -114,7 +114,7 @@ UNFINISHED_FOLDERS = {
     "cut short": (
         "normals.npy",
         lambda path: os.truncate(path, 100),
-        "normals.npy has another size than",
+        "the size of normals.npy differs from",
     ),
     "no such name": ("report.json", surrogate_among_files, "\\ud800 is missing"),
 }
@@ -271,7 +271,7 @@ def test_an_interruption_of_a_capture_ends_it(run, capture, monkeypatch):
 
 
 REFUSED_OPTIONS = """
---json | --json prints one list at the end, and watch has none
+--json | --json prints a list at the end, but watch does not end
 --shard 1/2 | --shard splits a list of captures
 other | found other after the dashes, expected options of infer
 -o sphere/../sphere | the results would be among the captures

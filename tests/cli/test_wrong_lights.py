@@ -95,7 +95,7 @@ def test_info_lists_the_readings(run, medallion):
         code=3,
         says=(
             "--light-frame swap-xy",
-            "splinecli: medallion: an input is probably wrong (light_frame), as the warnings say",
+            "splinecli: medallion: an input is probably wrong (light_frame); see the warnings",
         ),
     )
     assert "x and y exchanged  " in wrong.out

@@ -1,4 +1,3 @@
-"""The command line: the only place with typer, rich, printing and exit codes.
-
-It begins in main.py.
+"""The command line, which starts in main.py. Only this package uses typer and rich, prints, and
+sets exit codes.
 """

@@ -1,4 +1,4 @@
-"""The other commands: calibrate, integrate, evaluate, prepare, train and import-weights."""
+"""The commands calibrate, integrate, evaluate, prepare, train and import-weights."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def evaluate(options: EvaluateOptions) -> int:
 
 
 def _print_table(evaluation: Evaluation) -> None:
-    """Print methods by captures, or captures by methods where that is too wide for the terminal."""
+    """Print methods by captures, or captures by methods if the terminal is too narrow."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -125,7 +125,7 @@ def _print_table(evaluation: Evaluation) -> None:
     for row in cells[1:]:
         table.add_row(*row)
     print(caption(evaluation))
-    # A table that is too wide can still be read; one that is cut cannot.
+    # A table that is too wide is better than one that is cut off.
     widest = console.measure(table, options=console.options.update(max_width=10_000)).maximum
     Console(highlight=False, width=max(console.width, widest)).print(table, crop=False)
 
@@ -165,10 +165,10 @@ def import_weights(options: ImportOptions) -> None:
     """
     output = options.output
     if output.is_dir():
-        raise OutputError("is a folder, expected a file", path=output, hint="Name a file with -o")
+        raise OutputError("found a folder, expected a file", path=output, hint="Pass a file to -o")
     if output.exists() and not options.overwrite:
         raise OutputError(
-            "exists already", path=output, hint="Add --overwrite, or choose another place with -o"
+            "the file exists already", path=output, hint="Add --overwrite, or choose another -o"
         )
 
     from splinecli.workshop.import_weights import import_official
@@ -191,7 +191,7 @@ def train(options: TrainOptions) -> None:
     from splinecli.workshop.training.config import parse_parameter, parse_sources
     from splinecli.workshop.training.loop import configure_run, open_run
 
-    changes: list[dict[str, Any]] = []  # in the order of their precedence
+    changes: list[dict[str, Any]] = []  # in ascending order of precedence
     if options.sets or options.generator_weight is not None:
         changes.append({"sources": parse_sources(options.sets, options.generator_weight)})
     given = {"pixels": options.n_lights, "start_from": options.start_from}
@@ -222,10 +222,10 @@ def _run(trainer: Trainer, messages: Messages) -> None:
     if single := trainer.task.sets.single_scene_sets:
         names = ", ".join(single)
         messages.warn(
-            f"{names}: the set has a single scene, so training and validation use the same pixels"
+            f"{names}: the set has only one scene, so training and validation use the same pixels"
         )
     if trainer.workers.leads and trainer.log.set_aside:
-        messages.warn(f"metrics.csv was damaged and was renamed {trainer.log.set_aside}")
+        messages.warn(f"metrics.csv was damaged and has been renamed to {trainer.log.set_aside}")
     shown = trainer.progress
     if shown >= 1:
         messages.say(
@@ -238,7 +238,8 @@ def _run(trainer: Trainer, messages: Messages) -> None:
             nonlocal shown
             advance(progress - shown, _losses(metrics))
             shown = progress
-            # A terminal shows the bar. A log file gets a line with each checkpoint.
+            # On a terminal, there is a progress bar. Elsewhere, a line is printed with each
+            # checkpoint.
             if metrics.validation_deg is not None and (progress >= 1 or not sys.stderr.isatty()):
                 messages.say(f"step {metrics.step}, {metrics.pixels} pixels, {_losses(metrics)}")
 
@@ -246,7 +247,7 @@ def _run(trainer: Trainer, messages: Messages) -> None:
 
 
 def _losses(metrics: Metrics) -> str:
-    """Return the losses in words.
+    """Return the losses as text.
 
     Example: "1.5 minutes: loss 0.412, map 0.051, 8.31 deg, 9.02 deg in validation".
     """

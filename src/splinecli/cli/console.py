@@ -1,8 +1,8 @@
 """Output for users and programs: reports, messages, tables and progress.
 
-Each error becomes one message and an exit code and, with JSON output, also a document. Typer and
-click change the names of their parser errors, such as an unknown option or a word instead of a
-number, from version to version. We therefore rely only on the attributes of these errors. An error
+Each error becomes one message and an exit code and, with JSON output, also a document. The class
+names of Typer's and click's parser errors, such as an unknown option or a word instead of a number,
+differ between versions. Therefore, only the attributes of these errors are used, and an error
 without a known attribute keeps its text.
 """
 
@@ -25,19 +25,19 @@ from splinecli.system.progress import Advance, Observer, ignore
 
 # for unexpected errors
 DEFECT = "this is a defect of splinecli; please report it with the lines above."
-# Typer carries its own copy of click, in a place that changes with the version. This is click's
-# base of usage errors.
-ParserError: type[Exception] = typer.BadParameter.__mro__[1]  # for invalid arguments
-# Click's texts as regular expressions, and the words that replace them
+# The base class of click's usage errors. Typer includes its own copy of click, whose location
+# depends on the version.
+ParserError: type[Exception] = typer.BadParameter.__mro__[1]
+# Click's messages as regular expressions, and their replacements
 _SYNTAX = (
     (r"^Option '(.+)' requires an argument\.?$", r"\1 needs a value"),
-    (r"^Option '(.+)' does not take a value\.?$", r"\1 takes no value"),
+    (r"^Option '(.+)' does not take a value\.?$", r"\1 does not take a value"),
     (r"^Missing argument '(.+)'\.?$", r"\1 is missing"),
     (r"^Missing option '([^']+)'.*$", r"\1 is missing"),
     (r"^Missing command\.?$", "a command is missing"),
     (r"^Got unexpected extra arguments?(?:\(s\))? \((.+)\)$", r"unexpected arguments: \1"),
 )
-# options of earlier versions
+# Options of earlier versions
 RENAMED = {"--stiffness": "--discontinuity", "--lights-format": "--light-format"}
 
 
@@ -48,7 +48,7 @@ def explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, ParserError):
         return _usage_message(error), UsageError.exit_code
     if is_out_of_memory(error):
-        problem = "there is not enough memory. Close other programs, or use smaller images."
+        problem = "not enough memory is available. Close other programs, or use smaller images."
         return problem, SplinecliError.exit_code
     if isinstance(error, OSError):
         return explain(as_splinecli_error(error))
@@ -56,7 +56,7 @@ def explain(error: Exception) -> tuple[str, int]:
 
 
 def error_document(error: Exception) -> dict[str, Any]:
-    """Return {"error", "exit_code"}, the document that replaces a report."""
+    """Return {"error", "exit_code"}, which is printed instead of a report."""
     message, exit_code = explain(error)
     return {"error": message, "exit_code": exit_code}
 
@@ -67,8 +67,8 @@ def printed_documents(
 ) -> Iterator[Callable[[dict[str, Any]], None]]:
     """Yield a function that prints a document of `infer` as soon as its capture is finished.
 
-    Each document is a line, or an item of a single list. An error that ends the command is printed
-    last.
+    Each document is printed on a line of its own, or as an item of a list. If an error ends the
+    command, its document comes last.
     """
     is_empty = True
 
@@ -92,7 +92,7 @@ def printed_documents(
 
 
 def _usage_message(error: Any) -> str:
-    """Return the message for click's usage error, with a pointer to help."""
+    """Return the message for a usage error from click, with a reference to the help."""
     context = getattr(error, "ctx", None)
     where = context.command_path if context else "splinecli"
     text = _unknown_name(error) or error.format_message()
@@ -120,8 +120,8 @@ def _unknown_name(error: Any) -> str | None:
     )
 
 
-_LEAST_DONE = 0.05  # share of the work below which the time that is left is unknown
-LINE_SECONDS = 30.0  # seconds between two progress lines if stderr is not a terminal
+_LEAST_DONE = 0.05  # share of the work after which the remaining time is shown
+LINE_SECONDS = 30.0  # time between two progress lines if stderr is not a terminal
 
 
 def print_report(report: dict[str, Any], *lines: str, as_json: bool, quiet: bool) -> None:
@@ -134,15 +134,15 @@ def print_report(report: dict[str, Any], *lines: str, as_json: bool, quiet: bool
 
 
 def print_lines(text: str) -> None:
-    """Print a text of several lines on stderr, such as a traceback."""
+    """Print a text of several lines, such as a traceback, on stderr."""
     for line in text.rstrip("\n").split("\n"):
         print(printable(line), file=sys.stderr)
 
 
 class Messages(Observer):
-    """Writes human-readable messages to stderr, or nothing with `quiet`.
+    """Prints messages on stderr, or nothing with `quiet`.
 
-    On a terminal, progress is shown as a bar, elsewhere as one line every LINE_SECONDS.
+    On a terminal, progress is shown as a bar; elsewhere, one line is printed every LINE_SECONDS.
     """
 
     def __init__(self, *, quiet: bool) -> None:
@@ -159,10 +159,10 @@ class Messages(Observer):
         self._warned.add(once)
 
     def error(self, message: str) -> None:
-        print(f"splinecli: {printable(message)}", file=sys.stderr)  # even with `quiet`
+        print(f"splinecli: {printable(message)}", file=sys.stderr)  # also with `quiet`
 
     def table(self, rows: Sequence[Sequence[str]]) -> None:
-        """Print a table: a header row, then rows of a name and numbers."""
+        """Print a table that consists of a header row and rows with a name and numbers."""
         if self.quiet:
             return
         from rich.console import Console

@@ -1,6 +1,6 @@
 """The help of a command: its options by panel, and examples.
 
-The man pages and the site use the same texts (man/make_pages.py, docs/site_pages.py).
+The man pages and the website use the same texts (man/make_pages.py, docs/site_pages.py).
 """
 
 import os
@@ -46,10 +46,10 @@ EXAMPLES = {
     " official.safetensors": "Convert the authors' weights,"
     " then use --weights official.safetensors.",
 }
-"""Command line -> what it does."""
+"""Maps command lines to their descriptions."""
 
-EXAMPLE_WIDTH = 64  # columns; with its indent an example fits a terminal of 80 columns
-_TERM_WIDTH = 26  # columns for an option and its value; a longer one has a line of its own
+EXAMPLE_WIDTH = 64  # columns, so that an indented example fits into a terminal of 80 columns
+_TERM_WIDTH = 26  # columns for an option and its value; longer ones are on a separate line
 
 
 def examples_of(name: str) -> dict[str, str]:
@@ -58,14 +58,16 @@ def examples_of(name: str) -> dict[str, str]:
 
 
 def wrap_example(command_line: str) -> str:
-    """Return a long command on several lines, with each option beside its value."""
+    """Return a long command on several lines, keeping each option and its value on the same
+    line.
+    """
     whole = re.sub(r"( -\S+) (?!-)", "\\1\0", command_line)
     lines = textwrap.wrap(whole, EXAMPLE_WIDTH, break_long_words=False, break_on_hyphens=False)
     return " \\\n    ".join(lines).replace("\0", " ")
 
 
 def help_panels(command: Any, context: Any) -> dict[str, list[tuple[str, str]]]:
-    """Return the rows of each panel of a command's help: names, and what they mean."""
+    """Return the rows of each panel of a command's help, each with a name and its description."""
     panels: dict[str, list[tuple[str, str]]] = {}
     for parameter in command.get_params(context):
         if (record := parameter.get_help_record(context)) is None:
@@ -88,7 +90,7 @@ def help_panels(command: Any, context: Any) -> dict[str, list[tuple[str, str]]]:
 
 
 def write_help(command: Any, context: Any, formatter: Any) -> None:
-    """Write the help of a command as text of the terminal's width, with bold titles."""
+    """Write the help of a command as text that fits the terminal, with bold titles."""
 
     def section(title: str) -> Any:
         return formatter.section(

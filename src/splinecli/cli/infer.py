@@ -1,4 +1,4 @@
-"""`splinecli infer`, `watch` and `info`: normal maps of captures, or a summary of a capture."""
+"""The commands infer, watch and info: normal maps of captures, and a summary of a capture."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     )
     from splinecli.results.pages import IndexRow
 
-# of the last line, for these outcomes
+# Descriptions of outcomes in the last line
 _WORDS = {"skipped": "already done", "changed": "changed but kept"}
 
 
@@ -47,7 +47,7 @@ def infer(
 
     messages = Messages(quiet=batch.quiet)
     outcomes = infer_batch(
-        batch.captures,  # none for watch, which only checks the options
+        batch.captures,  # empty if watch only checks the options
         options,
         messages,
         redo=batch.redo,
@@ -136,11 +136,11 @@ def watch(context: Context, options: WatchOptions) -> None:
     given, output = run.params, run.params["output"].expanduser()
     if given["as_json"]:
         raise UsageError(
-            "--json prints one list at the end, and watch has none", hint="Give --jsonl"
+            "--json prints a list at the end, but watch does not end", hint="Use --jsonl instead"
         )
     if given["shard"] is not None:
         raise UsageError(
-            "--shard splits a list of captures, and watch has none",
+            "--shard splits a list of captures, but watch has no list",
             hint="Watch one folder for each shard",
         )
     if len(given["captures"]) > 1:
@@ -149,14 +149,14 @@ def watch(context: Context, options: WatchOptions) -> None:
         )
     if output.resolve() == folder.resolve():
         raise UsageError(
-            "the results would be among the captures", path=output, hint="Give another -o OUT"
+            "the results would be among the captures", path=output, hint="Choose another -o OUT"
         )
     given["captures"] = []
-    infer.invoke(run)  # refuses wrong options now, not when the first capture arrives
+    infer.invoke(run)  # reports invalid options before the first capture arrives
     arrivals = Arrivals(folder, marker=options.marker, seconds=options.settle, without=output)
     messages = Messages(quiet=given["quiet"])
     ready, is_there = arrivals.take(), True
-    messages.say(f"{folder}: waiting for captures; Ctrl-C ends")
+    messages.say(f"{folder}: waiting for captures; press Ctrl-C to stop")
     while True:
         if ready:
             run.params["captures"] = ready
@@ -168,7 +168,7 @@ def watch(context: Context, options: WatchOptions) -> None:
             if not is_there:
                 messages.say(f"{folder}: the folder is available again")
             is_there = True
-        except InputError as error:  # a network drive may be away for a moment
+        except InputError as error:  # a network drive may be temporarily unavailable
             if is_there:
                 messages.warn(f"{error} Waiting for it.")
             ready, is_there = [], False
@@ -190,8 +190,7 @@ def info(reading: ReadingOptions, options: InfoOptions) -> int:
     wrong = sorted(PROBABLY_WRONG.intersection(report["warning_codes"]))
     if reading.strict and wrong:
         messages.error(
-            f"{options.capture}: an input is probably wrong ({', '.join(wrong)}), as the warnings"
-            " say."
+            f"{options.capture}: an input is probably wrong ({', '.join(wrong)}); see the warnings."
         )
         return InputError.exit_code
     return 0

@@ -1,6 +1,6 @@
 """The Typer app and the entry point, which turns every error into an exit code.
 
-Importing it must stay cheap.
+Importing this module must stay fast.
 """
 
 from __future__ import annotations
@@ -61,10 +61,10 @@ from splinecli.system.machine import check_address_space, keep_freed_memory
 
 
 def command(function: Callable[..., int | None], module: str) -> Callable[..., int | None]:
-    """Return a function for Typer that takes the options of a function's records.
+    """Return a function for Typer that accepts the options of a function's records.
 
-    It calls the function with the records. The module defines the records. It is imported here, so
-    that it does not slow down the help of other commands.
+    It calls the function with the records. The module that defines them is imported here, so that
+    it does not slow down the help of other commands.
     """
     kinds = get_type_hints(function, localns=vars(import_module(module)))
     del kinds["return"]
@@ -87,7 +87,7 @@ def command(function: Callable[..., int | None], module: str) -> Callable[..., i
 
 
 def help_of(function: Callable[..., object]) -> str:
-    """Return the text of a function's docstring, with a line for each paragraph."""
+    """Return the text of a function's docstring, with each paragraph on one line."""
     paragraphs = inspect.cleandoc(function.__doc__ or "").split("\n\n")
     return "\n\n".join(" ".join(text.split()) for text in paragraphs)
 
@@ -104,9 +104,8 @@ def _options(record: type[Record]) -> Iterator[tuple[str, Option, Any, Any]]:
 
 
 def _parameter(name: str, option: Option, kind: Any, default: Any) -> inspect.Parameter:
-    """Return Typer's parameter for a field.
-
-    Record.from_arguments converts texts to numbers and lists.
+    """Return Typer's parameter for a field. Record.from_arguments converts texts to numbers and
+    lists.
     """
     typed, metavar, complete = plain(kind), option.metavar, option.complete
     choices, repeated = choices_of(kind), get_origin(typed) is list and not option.items
@@ -126,7 +125,7 @@ def _parameter(name: str, option: Option, kind: Any, default: Any) -> inspect.Pa
         typed = typed | None
     if complete is not None and not callable(complete):
         complete = _offer(complete)
-    # By default, Typer refuses a path without permission. One such capture would then end a batch.
+    # By default, Typer rejects an unreadable path, so one such capture would end a batch.
     shared: dict[str, Any] = {
         "metavar": metavar,
         "help": option.help,
@@ -148,7 +147,7 @@ def _offer(names: Collection[str]) -> Callable[[], list[str]]:
     return lambda: list(names)
 
 
-# the command whose JSON is a list of documents, and the option that asks for it
+# The command whose JSON output is a list of documents, and the option for JSON output
 INFER, JSON = "infer", "--json"
 
 _MODULES: dict[str, tuple[Callable[..., int | None], ...]] = {
@@ -161,11 +160,11 @@ COMMANDS = {
     for module, functions in _MODULES.items()
     for each in functions
 }
-"""Name of a command -> its function, and the module that declares its options."""
+"""Maps names of commands to their functions and the modules that declare their options."""
 
 
 class Command(TyperCommand):
-    """A command that expands `~` in its arguments, and creates its options on demand.
+    """A command that expands `~` in its arguments and creates its options on demand.
 
     With --json, a command that fails also prints a document on stdout: {"error", "exit_code"}.
     """
@@ -177,16 +176,17 @@ class Command(TyperCommand):
         return typer.main.get_command(alone)
 
     def __getattribute__(self, name: str) -> Any:
-        """Return an attribute, creating the options only now, because their imports are slow."""
+        """Return an attribute. The options are created on demand, because their imports are
+        slow.
+        """
         own = self._made if name in ("params", "callback") else super()
         return own.__getattribute__(name)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments.
-
-        The context is added to parser errors, so that the message names the command.
+        """Parse the arguments, and add the context to parser errors, so that messages name the
+        command.
         """
-        # The parser removes them from the list.
+        # The parser will remove them from the list.
         wants_json, wants_lines = JSON in args, "--jsonl" in args
         try:
             return super().parse_args(ctx, args)
@@ -212,7 +212,7 @@ class Command(TyperCommand):
                 raise UsageError(problem, hint="Change to another folder") from None
             try:
                 return super(Command, self).invoke(ctx)
-            except EOFError as error:  # click would treat it as an interruption by the user
+            except EOFError as error:  # click treats it as an interruption by the user
                 raise RuntimeError("unexpected end of a file") from error
 
         try:
@@ -236,10 +236,10 @@ class Command(TyperCommand):
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
         """Return the completions of a word, each with one line of help.
 
-        Shells treat a second line as another word.
+        Shells would treat a second line as another word.
         """
         items = super().shell_complete(ctx, incomplete)
-        for item in items:  # Typer breaks the help beside an option at 80 columns
+        for item in items:  # Typer wraps the help of an option at 80 columns
             item.help = textwrap.shorten(item.help or "", 72, placeholder=" ...")
         return items
 
@@ -248,7 +248,7 @@ class Command(TyperCommand):
         return [re.sub("[{}]", "", piece) for piece in super().collect_usage_pieces(ctx)]
 
     def get_help_option(self, ctx: Any) -> Any:
-        """Return the option --help, in the panel of the output."""
+        """Return the option --help, which is shown in the panel of the output."""
         option: Any = super().get_help_option(ctx)
         option.rich_help_panel, option.metavar = "Output", ""
         return option
@@ -270,7 +270,7 @@ class Commands(TyperGroup):
     """The command splinecli itself."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the help as that of each command."""
+        """Write the help in the same form as for each command."""
         write_help(self, ctx, formatter)
 
 
@@ -311,13 +311,12 @@ for _name, (_function, _) in COMMANDS.items():
 def main(args: Sequence[str] | None = None) -> int:
     """Run `splinecli ARGS` and return the exit code (see docs/files-and-frames.md)."""
     _repair_streams()
-    # By default, PyTorch's threads spin while they wait for each other. On a machine that is busy
-    # with other work this takes cores from the thread that computes. PyTorch reads the variable
-    # when it is first imported.
+    # By default, PyTorch's threads spin while they wait for each other, which takes cores from the
+    # computing thread if the machine is busy. PyTorch reads the variable when it is first imported.
     if "GOMP_SPINCOUNT" not in os.environ:
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     logging.disable()  # logs of libraries, such as Dask, are not meant for users
-    # about other versions on workers. See Work.enter
+    # Work.enter already checks the versions on workers
     warnings.filterwarnings("ignore", module="distributed")
     out, err = UntilClosed(sys.stdout), UntilClosed(_apart(sys.stderr))
     with redirect_stdout(out), redirect_stderr(err):
@@ -347,10 +346,10 @@ def _run_command(args: Sequence[str] | None) -> int:
 
 
 class UntilClosed:
-    """A text stream that drops all output once its pipe is closed.
+    """A text stream that discards all output once its pipe is closed.
 
-    All other attributes are the stream's. With a plain stream, the next line that a command prints
-    would raise an error and end the command's work.
+    With a plain stream, the next line that a command prints would raise an error and end the
+    command.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -389,17 +388,17 @@ def _repair_streams() -> None:
 
 
 def _apart(stream: TextIO) -> TextIO:
-    """Return the stream stderr with a file descriptor of its own.
+    """Return the stream stderr with a separate file descriptor.
 
-    Descriptor 2 is redirected while an image is decoded, because the C libraries print there (see
-    native_stderr). With its own descriptor, other threads can still print in the meantime.
+    Descriptor 2 is redirected while an image is decoded, because C libraries print there (see
+    native_stderr). With a separate descriptor, other threads can print in the meantime.
     """
     if not isinstance(stream, io.TextIOWrapper) or stream.fileno() != 2:
         return stream
     stream.flush()
     try:
         own = os.fdopen(os.dup(2), "wb", buffering=0)
-    except OSError:  # a limit on open files; the command reports it
+    except OSError:  # a limit on open files, which the command will report
         return stream
     return io.TextIOWrapper(
         own, stream.encoding, stream.errors, line_buffering=True, write_through=True

@@ -1,6 +1,6 @@
-"""End the process with exit code 130 on Ctrl-C and SIGTERM.
+"""End the process with exit code 130 on Ctrl-C and on SIGTERM, which job schedulers send.
 
-SIGTERM, which job schedulers send, ends it within two seconds.
+SIGTERM ends the process within two seconds.
 """
 
 import math
@@ -13,23 +13,23 @@ from contextlib import suppress
 from types import FrameType
 
 INTERRUPTED = 130  # exit code of an interrupted process
-# time that the command has to clean up
+# how long the command may take to clean up
 GRACE_SECONDS = {int(signal.SIGTERM): 1.5, int(signal.SIGINT): 5.0}
-# set when the command reports the interruption itself, to avoid a second message
+# set when the command itself reports the interruption, to avoid a second message
 TOLD = threading.Event()
 DEFERRED = threading.Event()  # set when a signal arrives during an import, which must finish first
 
 
 def end_on_signals() -> None:
-    """Raise KeyboardInterrupt in the main thread at Ctrl-C and SIGTERM.
+    """Raise KeyboardInterrupt in the main thread on Ctrl-C and SIGTERM.
 
-    If this does not end the process in time, it is ended from another thread. Python delivers a
-    signal only between two of its instructions. One call into a library may take minutes, so may
-    the import of PyTorch in a thread that has to end first, and an exception in a callback of a
-    library is lost. A separate thread is notified of the signal immediately.
+    If this does not end the process in time, another thread ends it. Python delivers a signal only
+    between two of its instructions, but a call into a library may take minutes, as may the import
+    of PyTorch in a thread that has to finish first. An exception in a callback of a library may be
+    lost. A separate thread is notified of the signal immediately.
     """
     signal.signal(signal.SIGTERM, _interrupt)
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored, as by nohup
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # nohup ignores it
         signal.signal(signal.SIGINT, _interrupt)
     if os.name == "nt":
         return
@@ -46,17 +46,19 @@ def ignore_signals() -> None:
 
 
 def report_interruption() -> int:
-    """Print that the process was interrupted, unless the command has, and return the exit code."""
-    with suppress(OSError):  # stderr is closed
+    """Print that the process was interrupted, unless this was already printed, and return the exit
+    code.
+    """
+    with suppress(OSError):  # stderr may be closed
         if not TOLD.is_set():
             os.write(2, b"splinecli: interrupted.\n")
     return INTERRUPTED
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, or defer it until an import is done.
+    """Raise KeyboardInterrupt, or defer it until an import is finished.
 
-    The import of trimesh, for one, continues after any exception.
+    The import of trimesh, for example, continues after any exception.
     """
     while frame is not None:
         if frame.f_code.co_filename == "<frozen importlib._bootstrap>":

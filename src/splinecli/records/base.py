@@ -1,8 +1,9 @@
-"""Records: frozen options, settings and documents, declared once and checked when they are made.
+"""Records: frozen options, settings and documents, declared once and validated on construction.
 
-A field's annotation gives its type and its range (`msgspec.Meta`). A field that is an option of a
-command has an `option` instead of a default, or an annotation with an `Option`. The command line,
-the checks, `as_dict`, `from_dict`, the JSON Schema and the man pages follow from them.
+A field's annotation defines its type and its range (`msgspec.Meta`). A field that is an option of a
+command has an `option` as its default, or an annotation with an `Option`. The command line, the
+checks, `as_dict`, `from_dict`, the JSON Schema and the man pages are derived from these
+declarations.
 """
 
 from __future__ import annotations
@@ -52,13 +53,18 @@ Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 
 @dataclass(frozen=True)
 class Option:
-    """How a field is given on the command line: as `--field-name`, or by `names`.
+    """How a field is given on the command line.
 
-    panel: one of PANELS. metavar: placeholder for the value; "" for a flag or a choice. default:
-    text for a default of None in the help. names: such as "--output -o". complete: the values for
-    shell completion, or a function that returns them. parse: converts a text to the field's value,
-    or each text of an option that may be repeated: any with a tuple, but without items. items: the
-    names allowed in a list "a,b". value: the default of the field, or NODEFAULT.
+    Args:
+        panel: one of PANELS.
+        metavar: placeholder for the value; "" for a flag or a choice.
+        default: description of a default of None, for the help.
+        names: names such as "--output -o"; by default `--field-name`.
+        complete: the values for shell completion, or a function that returns them.
+        parse: converts a text to the field's value. For an option that may be repeated (a tuple
+            without items), it converts each text.
+        items: the names allowed in a list "a,b".
+        value: the default of the field, or NODEFAULT.
     """
 
     panel: str
@@ -82,7 +88,9 @@ class Option:
             names = tuple(item.strip() for item in given.split(",") if item.strip())
             for name in names:
                 if name not in self.items:
-                    problem = f"{title} has {name!r}; expected a list of {', '.join(self.items)}"
+                    problem = (
+                        f"{title} contains {name!r}; expected a list of {', '.join(self.items)}"
+                    )
                     raise UsageError(problem, hint=did_you_mean(name, self.items))
             if not names:
                 raise UsageError(f"{title} is empty; expected a list of {', '.join(self.items)}")
@@ -91,13 +99,13 @@ class Option:
         return tuple(map(parse, given)) if isinstance(given, list) else parse(given)
 
 
-# of any type, so that they can stand for the default of a field; a flag is off by default
+# Typed as Any, so that they can be defaults of fields. A flag is off by default
 option: Any = Option
 flag: Any = partial(Option, value=False)
 
 
 class _RecordMeta(StructMeta):
-    """Replaces the options of a record by the defaults of their fields."""
+    """Replaces the options in a record's body with the defaults of the fields."""
 
     def __new__(
         cls, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **settings: Any
@@ -117,11 +125,11 @@ class _RecordMeta(StructMeta):
 class Record(Struct, metaclass=_RecordMeta, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A frozen record of options, whose fields are validated.
 
-    Raises UsageError for an invalid value, or for two options that cannot be used together.
+    Raises UsageError for an invalid value, or if two options cannot be used together.
     """
 
     CONFLICTS: ClassVar[Conflicts] = ()
-    """Pairs of fields that cannot both differ from their defaults, each with a hint."""
+    """Pairs of fields of which only one may differ from its default, each with a hint."""
 
     def __post_init__(self) -> None:
         titles = {}
@@ -154,7 +162,7 @@ class Record(Struct, metaclass=_RecordMeta, frozen=True, kw_only=True, forbid_un
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Return the record from the result of `as_dict`.
+        """Return a record from the result of `as_dict`.
 
         Raises UsageError for an unknown name or an invalid value.
         """
@@ -179,7 +187,7 @@ class Record(Struct, metaclass=_RecordMeta, frozen=True, kw_only=True, forbid_un
 
 
 def _from_typer(kind: Any, option: Option, given: Any, title: str) -> Any:
-    """Convert Typer's value to a value of the field's type. Raises UsageError."""
+    """Convert a value from Typer to the type of the field. Raises UsageError."""
     value = option.value_of(given, title)
     if (number := number_of(kind)) is not None and option.parse is None:
         one: Any = Annotated[number, limits(kind)]
@@ -189,7 +197,8 @@ def _from_typer(kind: Any, option: Option, given: Any, title: str) -> Any:
     is_file = (is_name or isinstance(value, Path)) and not option.is_argument
     if is_file and str(value).startswith("-"):
         raise UsageError(
-            f"{title} needs a file or folder, found {value}", hint="Give it after the option"
+            f"{title} needs a file or folder, found {value}",
+            hint="Write the file or folder after the option",
         )
     return str(value) if is_name else value
 
@@ -209,13 +218,13 @@ def settings(
 ) -> dict[str, Any]:
     """Convert values from JSON or TOML to the types of the fields of a record or dataclass.
 
-    Raises the given error for an unknown name or an invalid value; `noun` precedes the name in its
-    message.
+    Raises the given error for an unknown name or an invalid value. In its message, `noun` precedes
+    the name.
     """
     kinds = field_types(record)
     for name in values:
         if name not in kinds:
-            problem = f"unknown {noun} {name!r}; known are {', '.join(sorted(kinds))}"
+            problem = f"unknown {noun} {name!r}, expected one of {', '.join(sorted(kinds))}"
             raise error(problem, hint=did_you_mean(name, kinds))
     return {
         name: converted(kinds[name], value, f"{noun} {name!r}", error)
@@ -226,10 +235,10 @@ def settings(
 def converted(
     kind: Any, value: Any, title: str, error: type[SplinecliError], *, strict: bool = True
 ) -> Any:
-    """Convert a value to a type, such as a list to a tuple.
+    """Convert a value to a type, for example a list to a tuple.
 
-    Raises the given error, which begins with the title. Unless `strict` is set, numbers may be
-    given as text.
+    Raises the given error, whose message starts with the title. Unless `strict` is set, numbers may
+    be given as text.
     """
     if isinstance(kind, type) and is_dataclass(kind) and isinstance(value, kind):
         return value
@@ -243,14 +252,14 @@ def converted(
 
 
 def choices_of(kind: Any) -> tuple[str, ...]:
-    """Return the names that a field may have, or () if it is not limited to names."""
+    """Return the names that a field may have, or an empty tuple if any value is allowed."""
     bare = plain(kind)
     parts = (bare, *get_args(bare))
     return next((get_args(part) for part in parts if get_origin(part) is Literal), ())
 
 
 def option_of(kind: Any) -> Option | None:
-    """Return how a field of this annotation is given on the command line."""
+    """Return how a field with this annotation is given on the command line."""
     metadata = getattr(kind, "__metadata__", ())
     return next((item for item in metadata if isinstance(item, Option)), None)
 
@@ -274,7 +283,7 @@ def _metadata(kind: Any) -> Iterator[Any]:
 
 
 def is_file_name(kind: Any) -> bool:
-    """Return whether a field of this annotation stores a path as text."""
+    """Return whether a field with this annotation stores a path as text."""
     return PATH in _metadata(kind)
 
 
@@ -288,7 +297,7 @@ def plain(kind: Any) -> Any:
 
 
 def kind_in_words(kind: Any) -> str:
-    """Describe the values of a type, such as "a number from 0 to 1"."""
+    """Return a description of the values of a type, such as "a number from 0 to 1"."""
     bare = plain(kind)
     if get_origin(bare) is Union:
         bare = get_args(bare)[0]
@@ -319,7 +328,9 @@ def _each(value: Any) -> tuple[Any, ...]:
 
 
 def number_of(kind: Any) -> type | None:
-    """Return int or float for numbers, optional numbers and lists of numbers."""
+    """Return int or float for numbers, optional numbers and lists of numbers; None for other
+    types.
+    """
     found = plain(kind)
     while get_args(found) and get_origin(found) is not Literal:
         found = get_args(found)[0]
@@ -327,7 +338,7 @@ def number_of(kind: Any) -> type | None:
 
 
 def complete_list(items: Iterable[str]) -> Callable[[str], list[str]]:
-    """Return a function that completes a list "a,b" by each possible next item."""
+    """Return a function that completes a list "a,b" with each name that may follow."""
 
     def complete(incomplete: str) -> list[str]:
         *typed, _ = incomplete.split(",")
@@ -337,6 +348,6 @@ def complete_list(items: Iterable[str]) -> Callable[[str], list[str]]:
 
 
 def listed(names: Iterable[str]) -> str:
-    """Return "a, b or c"."""
+    """Return the names as in "a, b or c"."""
     *most, last = names
     return f"{', '.join(most)} or {last}" if most else last

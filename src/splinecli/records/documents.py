@@ -1,6 +1,5 @@
-"""The documents that commands write and print as JSON, from which the schema is generated.
-
-It is docs/reports.schema.json.
+"""The documents that commands write and print as JSON, from which docs/reports.schema.json is
+generated.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from splinecli.records.white_level import WhiteLevel
 from splinecli.system.progress import STAGES
 
 Vector = tuple[float, float, float]
-Matrix = tuple[Vector, Vector, Vector]  # of a camera, in pixels
+Matrix = tuple[Vector, Vector, Vector]  # camera matrix or transform, in pixels
 Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 Camera = Literal["orthographic", "perspective"]
 Unit = Literal["pixel", "mean depth", "millimetre"]
@@ -33,7 +32,7 @@ class Document(Struct, kw_only=True, forbid_unknown_fields=True):
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as JSON values."""
-        # of NumPy
+        # Numbers may be NumPy's.
         values: dict[str, Any] = to_builtins(self, enc_hook=lambda number: number.item())
         return values
 
@@ -46,7 +45,7 @@ class UsedWeights(Document):
 
 
 class NearLampsReport(Document):
-    """Near lamps: distances from the middle of the object, all lengths in one unit."""
+    """Near lamps: their distances from the middle of the object. All lengths have the same unit."""
 
     distances: list[Positive]
     pixel_size: Positive
@@ -63,7 +62,7 @@ class MeanAndTail(Document):
 
 
 class Distillation(Document):
-    """How a capture was distilled. Numbers of pixels, and degrees."""
+    """How a capture was distilled, with numbers of pixels and angles in degrees."""
 
     sample: Natural
     held_out: Natural
@@ -93,8 +92,9 @@ class SurfaceFacts(Document):
 
 
 class AlignmentReport(Document):
-    """How images that moved were aligned: transforms from pixels (x, y, 1) of the reference, and
-    motions in pixels.
+    """How moved images were aligned.
+
+    The transforms apply to pixels (x, y, 1) of the reference, and motions are in pixels.
     """
 
     reference: str
@@ -104,7 +104,7 @@ class AlignmentReport(Document):
 
 
 class MaterialFacts(Document):
-    """The material: whether the images have no colour, and the confidence."""
+    """The material: whether the images are gray, and how well they determine it."""
 
     gray: bool
     mean_confidence: Share
@@ -113,7 +113,7 @@ class MaterialFacts(Document):
 
 
 class EstimateReport(Document):
-    """The part of a report of infer that describes the estimate."""
+    """The part of the report of infer that describes the estimate."""
 
     schema: Literal[3]  # incremented when the meaning of a field changes
     capture: str
@@ -146,13 +146,13 @@ class EstimateReport(Document):
     # standard deviation in pixels of the blur that was removed from the images
     removed_blur: float | None
     alignment: AlignmentReport | None
-    mended: list[Code]  # faults that were clear and were mended
+    mended: list[Code]  # unambiguous faults that were corrected
     material: MaterialFacts | None
     surface: SurfaceFacts | None
 
 
 class Report(EstimateReport):
-    """report.json of infer, and an item of the list of infer --json."""
+    """report.json of infer, and each item of the list printed by infer --json."""
 
     seconds: Annotated[
         dict[str, NotNegative], Meta(extra_json_schema={"required": [*STAGES, "total"]})
@@ -163,14 +163,14 @@ class Report(EstimateReport):
 
 
 class LevelReport(Document):
-    """The slope that was removed: its direction in x and y, and its angle."""
+    """The slope that was removed, in x and y, and its angle."""
 
     slopes: tuple[float, float]
     tilt_deg: NotNegative
 
 
 class SurfaceReport(SurfaceFacts):
-    """surface.json, and the document of integrate --json."""
+    """surface.json, and the document printed by integrate --json."""
 
     schema: Literal[3]
     normals: str
@@ -186,7 +186,7 @@ class SurfaceReport(SurfaceFacts):
 
 
 class ProtocolReport(Document):
-    """How an evaluation was done. With several evaluations, the settings that differ are lists."""
+    """The settings of an evaluation. With several evaluations, settings that differ are lists."""
 
     n_lights: DrawnLights | list[DrawnLights]
     trials: Count
@@ -218,26 +218,24 @@ class MethodResult(Document):
 
 
 class ComparisonReport(Document):
-    """Two methods compared trial by trial, on a capture or on the average over the captures, in
-    degrees.
-    """
+    """A comparison of two methods trial by trial, on one capture or averaged over the captures."""
 
-    # With one trial, or if the differences of all trials are equal but not zero, no test is
-    # possible, and the last four are None. If all differences are zero, the interval is (0, 0) and
-    # p is 1.
+    # The last four fields are None if no test is possible, which is the case with one trial or if
+    # the differences of all trials are equal but not zero. If all differences are zero, the
+    # interval is (0, 0) and p is 1.
     first: str
     second: str
     capture: str
     n_lights: DrawnLights
     light_noise_deg: NotNegative
     trials: int
-    difference_deg: float  # mean over the trials of the errors of `first` minus those of `second`
+    difference_deg: float  # mean difference between the errors of `first` and `second`
     std_deg: NotNegative  # population standard deviation of the differences
-    # 95 % of the mean difference, not corrected for the number of pairs: it can exclude 0 although
-    # nothing differs
+    # 95 % confidence interval of the mean difference. It is not corrected for the number of pairs,
+    # so it can exclude 0 although `differs` is false
     interval_deg: tuple[float, float] | None
     p_value: float | None
-    # p_value corrected for the number of pairs that were tested on this capture
+    # p_value corrected for the number of pairs tested on this capture
     p_holm: float | None
     differs: bool | None
 
@@ -259,8 +257,8 @@ class Likeness(Document):
 
 
 class RelightingReport(Document):
-    """The likeness of pictures of a capture to photographs under the lights that a draw leaves
-    out.
+    """How well relit pictures of a capture agree with photographs under the lights not in a
+    draw.
     """
 
     capture: str
@@ -273,7 +271,7 @@ class RelightingReport(Document):
 
 
 class Results(Document):
-    """results.json, and the document of evaluate --json."""
+    """results.json, and the document printed by evaluate --json."""
 
     schema: Literal[1]
     protocol: ProtocolReport
@@ -288,7 +286,9 @@ class Results(Document):
 
 
 class Failure(Document):
-    """Printed instead of a report after an error; only infer includes the name of the capture."""
+    """The document printed instead of a report after an error. Only infer includes the capture's
+    name.
+    """
 
     error: str
     exit_code: Count
@@ -296,11 +296,11 @@ class Failure(Document):
 
 
 def json_schema() -> dict[str, Any]:
-    """Return the JSON Schema of all documents, docs/reports.schema.json."""
+    """Return the JSON Schema of all documents, for docs/reports.schema.json."""
     references, parts = schema_components(
         (Report, SurfaceReport, Results, Failure), ref_template="#/$defs/{name}"
     )
-    for part in parts.values():  # the text of a docstring, without its line breaks
+    for part in parts.values():  # remove the line breaks of docstrings
         if "description" in part:
             part["description"] = " ".join(part["description"].split())
     return {

@@ -1,8 +1,8 @@
-"""The files that splinecli writes for users, and one row of MAPS for each optional map.
+"""The files that splinecli writes, with one row of MAPS for each optional map.
 
-The row determines how the map is computed, written, read, drawn and shown, how much memory it
-needs, and that its pictures are not read as photographs. The functions that make and draw a map are
-registered by results/map_values.py.
+A row defines how its map is computed, written, read, drawn and shown, how much memory it needs, and
+that its pictures are not read as photographs. results/map_values.py registers the functions that
+compute and draw the maps.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,6 @@ from pathlib import Path
 
 from splinecli.errors import InputError
 
-# The file of the normal map in each format
 NORMALS = {
     "png": "normals.png",
     "png8": "normals_8bit.png",
@@ -23,15 +22,15 @@ NORMALS = {
 
 ERROR_MAP, GLOSS = "error_map.png", "metallic_roughness.png"
 REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
-CAPTURE_SHEET = "capture.png"  # what was taken for what; also of `info`
-# With the lights estimated by `infer`. If results and capture share a folder, they may be the
-# user's own.
+CAPTURE_SHEET = "capture.png"  # contact sheet of the capture's files; also written by `info`
+# Lights estimated by `infer`. If results and capture share a folder, the user's own files may have
+# these names.
 FOUND_LIGHTS = ("light_directions.txt", "light_intensities.txt", "lights.png")
 FOUND_DIRECTIONS, FOUND_INTENSITIES, LIGHT_PLOT = FOUND_LIGHTS
-# of the other commands
+# Pictures written by other commands
 PLOTS = ("calibration.png", "light_noise.png", "contact_sheet.png", "curves.png", "maps.png")
 CALIBRATION, LIGHT_NOISE_PLOT, CONTACT_SHEET, CURVES, TRAINING_MAPS = PLOTS
-# per pixel of the mask, for integration or for the mesh and its files, whichever needs more
+# Memory per pixel of the mask for integration, or for the mesh and its files if they need more
 BYTES_OF_SURFACE = 600
 
 SURFACE_FILES = {
@@ -45,12 +44,11 @@ SURFACE_FILES = {
     "png": ("depth.png",),
     "exr": ("depth.exr",),
 }
-"""The file names of each format; the pictures are the textures of an OBJ file, if there are colours
-and a gloss.
-"""
-# of `integrate --level`
+"""The file names of each format. The pictures are the textures of an OBJ file, which exist if there
+are colours and a material."""
+# Files written by `integrate --level`
 LEVEL_NORMALS = LEVEL_MAP, LEVEL_PICTURE = ("level_normals.npy", "level_normals.png")
-SURFACE_REPORT = "surface.json"  # the report that `integrate` writes beside them
+SURFACE_REPORT = "surface.json"  # the report of `integrate`
 
 
 def file_names(formats: Sequence[str]) -> tuple[str, ...]:
@@ -62,16 +60,21 @@ def file_names(formats: Sequence[str]) -> tuple[str, ...]:
 class OutputMap:
     """A row of MAPS.
 
-    name: the name in --maps; the file names consist of it and each of the suffixes.
-    content: for the documentation. unit: the description of the values in TIFF and EXR files.
-    scale: the value shown as white in the picture by default; scale_text: the description of the
-    scale in the file. caption: below the picture on the page, which shows this map even if --maps
-    does not name it; "" leaves it out. needs_confidence: whether only methods with confidence have
-    it. reads_images: whether it reads the images again. bytes_per_pixel, bytes_per_observation:
-    memory. Maps that need any are computed before the others are written. seconds,
-    seconds_per_pixel: the expected time of a map that takes long, without reading the images.
-    fewest_lights: number of lights below which the map is refused. parts: if the map is written as
-    several maps, their names and channels instead of the above.
+    Args:
+        name: the name in --maps, to which each of the suffixes is added for the file names.
+        content: description for the documentation.
+        unit: description of the values in TIFF and EXR files.
+        scale: the value that is white in the picture by default.
+        scale_text: description of the scale in the file.
+        caption: text below the picture on the page, which shows this map even without --maps; "" if
+            the map is not on the page.
+        needs_confidence: whether the map is available only for methods with confidence.
+        reads_images: whether the images are read again.
+        bytes_per_pixel, bytes_per_observation: required memory. Maps that need any are computed
+            before the others are written.
+        seconds, seconds_per_pixel: the expected time for a slow map, without reading the images.
+        fewest_lights: with fewer lights, the map is refused.
+        parts: the names and channels of its parts, if the map is written as several maps.
     """
 
     name: str
@@ -92,13 +95,13 @@ class OutputMap:
 
     @property
     def files(self) -> dict[str, str]:
-        """The names of the map's files by suffix; if it has parts, by name."""
+        """The names of the map's files by suffix, or by name if it has parts."""
         if self.parts:
             return {name: name for part in self.parts for name in part.files}
         return {suffix: f"{self.name}.{suffix}" for suffix in self.suffixes}
 
     def check_lights(self, count: int, path: Path | None = None) -> None:
-        """Raise InputError, about a capture in `path`, if there are too few lights for the map."""
+        """Raise InputError for the capture in `path` if there are too few lights for the map."""
         if count < self.fewest_lights:
             raise InputError(
                 f"--maps {self.name} needs at least {self.fewest_lights} lights, found {count}",
@@ -109,14 +112,13 @@ class OutputMap:
 
 @dataclass(frozen=True)
 class MapPart:
-    """Some channels of a map that are written with it as a map of their own.
-
-    Its shape is (H, W) if there is only one.
+    """Channels of a map that are written as a map of their own, which is (H, W) for a single
+    channel.
     """
 
     name: str
-    first: int  # channel
-    last: int
+    first: int  # first channel
+    last: int  # channel after the last one
     has_values: bool = True
 
     @property
@@ -126,7 +128,6 @@ class MapPart:
 
 
 _ROWS = (
-    # the colours of two images, sums and the map
     OutputMap(
         name="albedo",
         content="diffuse albedo without highlights and cast shadows; float32, H x W x 3, linear"
@@ -135,7 +136,7 @@ _ROWS = (
         suffixes=("npy", "exr", "png"),
         caption="Diffuse albedo, scaled so that the brightest 1 % of the pixels are white",
         reads_images=True,
-        bytes_per_pixel=52,
+        bytes_per_pixel=52,  # the colours of two images, sums and the map
         bytes_per_observation=1,
     ),
     OutputMap(
@@ -202,9 +203,8 @@ MAPS = {row.name: row for row in _ROWS}
 
 
 def own_files() -> list[str]:
-    """Return the names of all files, except FOUND_LIGHTS, that may be written to a folder.
-
-    The commands are `infer` and `integrate`.
+    """Return the names of all files, except FOUND_LIGHTS, that `infer` and `integrate` may
+    write.
     """
     maps = (name for row in MAPS.values() for name in row.files.values())
     surface = (*file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS, SURFACE_REPORT)

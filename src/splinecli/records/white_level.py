@@ -13,5 +13,5 @@ class WhiteLevel:
     """The stored value from which observations are considered saturated."""
 
     value: float  # in the unit of the files, such as 4095
-    # given by the user, stated in the file, seen in the images, or the full scale of the files
+    # given by the user, stated in the files, found in the images, or the full scale of the files
     origin: Origin

@@ -1,1 +1,1 @@
-"""The results of `infer` for a capture: files, report, albedo, pages."""
+"""The results of `infer` for a capture: files, report, maps and pages."""

@@ -1,4 +1,4 @@
-"""Write the results of `infer` for a capture, either all of them or none."""
+"""Write the results of `infer` for a capture: either all of them or none."""
 
 from __future__ import annotations
 
@@ -52,11 +52,15 @@ def report_of(
 ) -> dict[str, Any]:
     """Return the report of an estimate (docs/infer.md), without material and surface.
 
-    write_estimate adds `seconds`, `folder` and `files`. The options are the options of `infer` as
-    JSON values. `inputs` is a digest that changes when an input file changes. `light_file` is None
-    if the lights were estimated from the images. `distillation` is the result of
-    DistilledEstimator.report, or None if the method estimated every pixel. `alignment` is the
-    result of AlignedImages.as_dict, or None.
+    write_estimate adds `seconds`, `folder` and `files`.
+
+    Args:
+        options: the options of `infer` as JSON values.
+        inputs: a digest that changes when an input file changes.
+        light_file: None if the lights were estimated from the images.
+        distillation: the result of DistilledEstimator.report, or None if the method was applied to
+            every pixel.
+        alignment: the result of AlignedImages.as_dict, or None.
     """
     capture = estimate.capture
     intensities, errors = capture.estimated_intensities, estimate.errors
@@ -102,7 +106,9 @@ def report_of(
 
 
 def peak_memory_mib() -> int | None:
-    """Return the peak memory usage of this process in MiB, or None if it is not reported."""
+    """Return the peak memory usage of this process in MiB; None if the system does not report
+    it.
+    """
     try:
         import resource
     except ImportError:  # Windows
@@ -119,7 +125,7 @@ class UnfinishedError(ValueError):
 
 
 UNUSABLE = (OSError, ValueError, KeyError, TypeError, AttributeError)
-"""The errors of a report that cannot be used, such as one that was edited."""
+"""The errors raised for a report that cannot be used, for example because it was edited."""
 
 
 def write_estimate(
@@ -127,11 +133,11 @@ def write_estimate(
 ) -> dict[str, Any]:
     """Write the results of a capture to `folder` and return the finished report.
 
-    `report` comes from report_of. The files, which are named in own_files() and FOUND_LIGHTS,
-    replace the files of an earlier run (see new_files). The caller has locked the folder. Writing
-    is the clock's last stage. Raises OutputError if a file cannot be written.
+    `report` comes from report_of. The files, whose names are in own_files() and FOUND_LIGHTS,
+    replace the files of an earlier run (see new_files). The caller must have locked the folder.
+    Writing is the clock's last stage. Raises OutputError if a file cannot be written.
     """
-    # The user may have edited the mask of an earlier run and passed it to this run: keep it.
+    # The user may have edited the mask of an earlier run and passed it to this run, so it is kept.
     stale = {*output_files.own_files(), *own_light_files(folder)} - {output_files.FOUND_MASK}
     with new_files(folder, report=REPORT, stale=stale) as new:
         for name, content in files:
@@ -149,7 +155,9 @@ def write_estimate(
 
 
 def own_light_files(folder: Path) -> list[str]:
-    """Return the FOUND_LIGHTS that an earlier run wrote to a folder, according to its report."""
+    """Return which FOUND_LIGHTS were written to a folder by an earlier run, according to its
+    report.
+    """
     try:
         return [name for name in output_files.FOUND_LIGHTS if name in read_report(folder)["files"]]
     except UNUSABLE:
@@ -157,9 +165,9 @@ def own_light_files(folder: Path) -> list[str]:
 
 
 def read_report(folder: Path) -> dict[str, Any]:
-    """Return the report in a folder of results if its list of files is correct.
+    """Return the report in a folder of results if the listed files exist. Links are not followed.
 
-    Links are not followed. The rest of the report is not checked.
+    The rest of the report is not checked.
 
     Raises:
         UnfinishedError: the report or a file is missing, or a file has another size.
@@ -168,7 +176,7 @@ def read_report(folder: Path) -> dict[str, Any]:
     if not is_plain(folder / REPORT):
         raise UnfinishedError(f"has no {REPORT}")
     report: dict[str, Any] = read_json(folder / REPORT)
-    files, sizes = report["files"], report.get("file_sizes", {})  # earlier versions stated no sizes
+    files, sizes = report["files"], report.get("file_sizes", {})  # not in earlier versions
     convert((files, sizes), tuple[list[str], dict[str, Any]])  # raises ValueError
     # Users may edit the mask, and `integrate` may have replaced the surface.
     surface_files = file_names(tuple(SURFACE_FILES)) if is_plain(folder / SURFACE_REPORT) else ()
@@ -181,13 +189,13 @@ def read_report(folder: Path) -> dict[str, Any]:
             raise UnfinishedError(f"contains earlier results, but {name} is missing")
         if name in sizes and path.stat().st_size != sizes[name]:
             raise UnfinishedError(
-                f"contains earlier results, but {name} has another size than {REPORT} states"
+                f"contains earlier results, but the size of {name} differs from {REPORT}"
             )
     return report
 
 
 def normal_files(estimate: NormalEstimate, formats: Sequence[str], convention: Convention) -> Files:
-    """Yield the normal map in these formats (keys of NORMALS), and the error map if known."""
+    """Yield the normal map in these formats (keys of NORMALS), and the error map if it is known."""
     for form in formats:
         yield output_files.NORMALS[form], encode_normals(estimate, form, convention)
     if estimate.error_map_deg is not None:
@@ -197,8 +205,8 @@ def normal_files(estimate: NormalEstimate, formats: Sequence[str], convention: C
 def encode_normals(estimate: NormalEstimate, form: str, convention: Convention) -> Content:
     """Return the file of the normal map: a PNG picture, or float32 NPY, TIFF or EXR.
 
-    The picture has 16 or 8 bits. EXR has the same colours as the pictures, (n + 1) / 2 and black
-    outside the mask, because renderers expect them.
+    The picture has 16 or 8 bits. EXR files have the same colours as the pictures, (n + 1) / 2 and
+    black outside the mask, because renderers expect them.
     """
     if form in ("png", "png8"):
         picture = encode_picture(
@@ -224,7 +232,7 @@ def encode_normals(estimate: NormalEstimate, form: str, convention: Convention) 
 
 
 def light_files(capture: Capture, plot: bytes) -> Files:
-    """Yield the lights estimated from the images, as `--lights` reads them, and their plot."""
+    """Yield the lights estimated from the images, in the format of `--lights`, and their plot."""
     yield output_files.FOUND_DIRECTIONS, rows_text(capture.light_directions)
     if (intensities := capture.estimated_intensities) is not None:
         text = rows_text(np.repeat(intensities[:, None], 3, axis=1))

@@ -1,5 +1,5 @@
-"""Functions from the normals and the images of a capture to the values of its maps, registered by
-the rows of MAPS.
+"""Functions that compute the values of maps from the normals and the images of a capture,
+registered for the rows of MAPS.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ Make = Callable[[CaptureSource, "NormalEstimate", Progress], NDArray[np.float32]
 
 
 class MapFunctions(NamedTuple):
-    """The functions of a row of MAPS."""
+    """The functions for a row of MAPS."""
 
-    make: Make  # to float32 values (H, W) or (H, W, C); None if the map is not available
-    picture: Callable[..., Picture]  # from values and mask, and the scale if the row has one
+    make: Make  # returns float32 values (H, W) or (H, W, C), or None if the map is not available
+    picture: Callable[..., Picture]  # takes values and mask, and the scale if the row has one
 
 
 MAP_FUNCTIONS: dict[str, MapFunctions] = {}
@@ -42,8 +42,8 @@ MAP_FUNCTIONS: dict[str, MapFunctions] = {}
 def makes(
     name: str, picture: Callable[..., Picture], **parts: Callable[..., Picture]
 ) -> Callable[[Make], Make]:
-    """Register a function as the one that makes a row of MAPS, with the pictures of the row and of
-    its parts.
+    """Register a function that computes a row of MAPS, with the pictures of the row and of its
+    parts.
     """
 
     def register(make: Make) -> Make:
@@ -97,12 +97,12 @@ def albedo_map(
     """Return the linear RGB diffuse albedo (H, W, 3), zero outside the mask and where no light
     reaches.
 
-    A pixel's albedo is the least-squares solution of Lambert's law, I = albedo * n.l, over the
-    lights that agree with the pixel's median of I / (n.l). Its scale is the scale of the images
-    divided by the light intensities, so it is known up to one factor for the whole capture unless
-    the intensities are absolute.
+    The albedo of a pixel is the least-squares solution of Lambert's law, I = albedo * n.l, over the
+    lights that agree with the pixel's median of I / (n.l). It has the scale of the images divided
+    by the light intensities, so it is known up to one factor for the whole capture unless the
+    intensities are absolute.
 
-    The images of the source are read again, one at a time, for their colours; `progress` is called
+    For their colours, the images of the source are read again, one at a time; `progress` is called
     after each. The capture must have been read from this source; under near lamps, it must contain
     its surface points. The normal map (H, W, 3) has unit length in its mask. Raises InputError if
     an image can no longer be read.
@@ -118,8 +118,7 @@ def albedo_map(
         cosine = _shading(capture, normals, slice(None), [position])[0][:, 0] * counts[:, position]
         weight = cosine
         if capture.restored is not None:
-            # The colour of a restored observation is saturated, so only the other observations are
-            # used.
+            # The colours of restored observations are saturated, so they have a very low weight.
             weight = cosine * np.where(
                 capture.restored[:, position], np.float32(1e-3), np.float32(1)
             )
@@ -135,8 +134,10 @@ def albedo_map(
 def colours_of_surface(
     source: CaptureSource, capture: Capture, normals: NDArray[np.float32], progress: Progress
 ) -> Iterator[NDArray[np.float32]]:
-    """Yield the linear RGB values (P, 3) of each image as under a distant white lamp of intensity
-    1; see albedo_map.
+    """Yield the linear RGB values (P, 3) of each image, converted to a distant white lamp of
+    intensity 1.
+
+    See albedo_map for the arguments.
     """
     images = source.read_pixels(capture.mask, capture.light_indices, StoredPixels.colours, progress)
     for position, colours in enumerate(images):
@@ -150,8 +151,8 @@ def colours_of_surface(
 def _shading(
     capture: Capture, normals: NDArray[np.float32], pixels: slice, positions: Sequence[int]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return n.l (p, K) for some pixels under K lights, and the lights' attenuation (p, K), or (1,
-    1) if distant.
+    """Return n.l (p, K) and attenuations (p, K) for pixels under K lights; (1, 1) for distant
+    lights.
     """
     if capture.lamps is None:
         lights = capture.light_directions[list(positions)].astype(np.float32)
@@ -166,15 +167,15 @@ def _shading(
 def agreeing_lights(
     observations: NDArray[np.float32], cosine: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Return which observations (P, F) are lit and neither highlights nor in cast shadow; `cosine`
-    (P, F) is n.l.
+    """Return which observations (P, F) are lit, but neither highlights nor in cast shadow.
+
+    `cosine` (P, F) is n.l.
     """
     lit = cosine > 0.15  # excludes grazing light
     albedo = np.divide(observations, cosine, out=np.full_like(observations, np.inf), where=lit)
-    # The median of the lit observations, which sorting moves to the front.
+    # Sorting moves the lit observations to the front.
     ordered, number = np.sort(albedo, axis=1), lit.sum(axis=1)
     middle = np.take_along_axis(ordered, np.maximum((number - 1) // 2, 0)[:, None], axis=1)
     with np.errstate(invalid="ignore"):
-        # The other observations are highlights or in cast shadow.
         close: NDArray[np.bool_] = lit & (np.abs(albedo - middle) <= 0.3 * middle)
     return close

@@ -1,4 +1,4 @@
-"""The optional maps of `infer`: their values, pictures and files, by the rows of MAPS."""
+"""The optional maps of `infer`: their values, pictures and files, as defined by MAPS."""
 
 from __future__ import annotations
 
@@ -21,9 +21,8 @@ if TYPE_CHECKING:
 
 
 def chosen_maps(names: Collection[str], *, page: bool = False) -> list[OutputMap]:
-    """Return the rows with these names and the rows shown on the page.
-
-    The rows that take the most memory come last.
+    """Return the rows with these names and the rows shown on the page, in ascending order of
+    memory.
     """
     rows = [row for row in MAPS.values() if row.name in names or (page and row.caption)]
     return sorted(rows, key=lambda row: row.bytes_per_pixel)
@@ -35,7 +34,7 @@ def make_map(
     estimate: NormalEstimate,
     progress: Progress = lambda: None,
 ) -> Float32Array | None:
-    """Return the values of a map, or None if the capture or the method does not provide it.
+    """Return the values of a map; None if the capture or the method does not provide it.
 
     Raises InputError.
     """
@@ -43,7 +42,9 @@ def make_map(
 
 
 def map_picture(row: OutputMap, values: Floats, mask: Bools, scale: float | None = None) -> Picture:
-    """Return a picture of a map's values (H, W) or (H, W, C); None uses the row's own scale."""
+    """Return a picture of a map's values (H, W) or (H, W, C). By default, the row's scale is
+    used.
+    """
     scales = [] if row.scale is None else [row.scale if scale is None else scale]
     return MAP_FUNCTIONS[row.name].picture(values, mask, *scales)
 
@@ -56,7 +57,7 @@ def map_files(
     *,
     scale: float | None = None,
 ) -> Iterator[tuple[str, Content]]:
-    """Yield the files of a map; TIFF and EXR only if they are requested."""
+    """Yield the files of a map. TIFF and EXR files are included only if they are requested."""
     for part in row.parts:
         channels = values[..., part.first : part.last]
         if part.has_values:

@@ -1,4 +1,4 @@
-"""The material of a capture as a map, and its pictures, in the conventions of glTF."""
+"""The material of a capture as a map, and its pictures, with the conventions of glTF."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 
 def share_picture(values: Float32Array, _: Bools) -> Picture:
-    """Return values (H, W, 1) as a gray picture (H, W): 0 is black, 1 and more is white."""
+    """Return values (H, W, 1) as a gray picture (H, W), where 0 is black and at least 1 is
+    white.
+    """
     return np.asarray(np.rint(255 * values[..., 0].clip(0, 1)), np.uint8)
 
 
@@ -33,9 +35,10 @@ def base_colour_picture(base_colour: Float32Array, _: Bools) -> Picture:
 
 
 def gloss_picture(values: Float32Array, mask: Bools) -> Picture:
-    """Return glTF's linear texture (H, W, 3) of roughness and metalness (H, W, 2).
+    """Return glTF's linear texture (H, W, 3) for roughness and metalness (H, W, 2).
 
-    Roughness is in green, metalness in blue. Red is for occlusion in glTF; it is white in the mask.
+    Roughness is green, and metalness blue. Red, which glTF uses for occlusion, is white in the
+    mask.
     """
     return np.asarray(
         np.rint(255 * np.dstack((mask.astype(np.float32), values)).clip(0, 1)), np.uint8
@@ -55,9 +58,8 @@ def gloss_picture(values: Float32Array, mask: Bools) -> Picture:
 def material(source: CaptureSource, estimate: NormalEstimate, progress: Progress) -> Float32Array:
     """Return the material (H, W, 7) of a capture, zero outside the mask.
 
-    The channels are base colour, roughness, metalness, specular reflection and confidence.
-
-    Raises InputError if an image can no longer be read, or there are too few lights.
+    The channels are base colour (3), roughness, metalness, specular reflection and confidence.
+    Raises InputError if an image can no longer be read, or if there are too few lights.
     """
     normals = take_pixels(estimate.normal_map, estimate.capture.mask)
     found = material_of(estimate, colours_of_surface(source, estimate.capture, normals, progress))
@@ -71,7 +73,7 @@ def material(source: CaptureSource, estimate: NormalEstimate, progress: Progress
 def material_of(
     estimate: NormalEstimate, colours: Iterable[Float32Array] | None = None
 ) -> MaterialMaps:
-    """Return the material of a capture; see estimate_material for the arguments and the errors."""
+    """Return the material of a capture. See estimate_material for the arguments and the errors."""
     from splinecli.materials.maps import estimate_material
 
     capture, confidence = estimate.capture, estimate.confidence_map
@@ -86,12 +88,11 @@ def material_of(
 
 
 _CONFIDENT, _LEAST_DETERMINED = 0.5, 0.1
-"""If a smaller share of the pixels has this confidence, the images do not determine the roughness.
-"""
+"""A confidence, and the share of pixels that need it for the roughness to be determined."""
 
 
 def material_facts(maps: Float32Array, mask: Bools) -> MaterialFacts:
-    """Return the facts that the report states about a material; gray images have equal channels."""
+    """Return the facts about a material for the report. In gray images, all channels are equal."""
     red, green, blue, roughness, *_, confidence = maps[mask].T
     return MaterialFacts(
         gray=bool((red == green).all() and (green == blue).all()),
@@ -102,23 +103,23 @@ def material_facts(maps: Float32Array, mask: Bools) -> MaterialFacts:
 
 
 def material_warnings(facts: MaterialFacts) -> list[CaptureWarning]:
-    """Return what the images do not determine about a material."""
+    """Return warnings about properties of a material that the images do not determine."""
     warnings = []
     if facts.gray:
         warnings.append(
             CaptureWarning(
-                GRAY_MATERIAL, "The images are gray, so base_colour shows brightness alone."
+                GRAY_MATERIAL, "The images are gray, so base_colour shows only brightness."
             )
         )
     if facts.determined < _LEAST_DETERMINED:
         warnings.append(
             CaptureWarning(
                 ROUGHNESS_UNDETERMINED,
-                f"The images do not determine the roughness: {facts.determined:.1%} of the pixels"
-                f" have a confidence of {_CONFIDENT} or more. Highlights are too few, or the"
-                " normals too uncertain. roughness.npy has the most likely values,"
-                f" {facts.median_roughness:.2f} in the median. Add lights, some near the camera"
-                " axis.",
+                f"The images do not determine the roughness: only {facts.determined:.1%} of the"
+                f" pixels have a confidence of at least {_CONFIDENT}, because there are too few"
+                " highlights or the normals are too uncertain. roughness.npy contains the most"
+                f" likely values, with a median of {facts.median_roughness:.2f}. Add lights, some"
+                " of them near the camera axis.",
             )
         )
     return warnings
@@ -131,11 +132,11 @@ PAGE_CAPTIONS = {
 
 
 def page_pictures(material: Float32Array) -> dict[str, Picture]:
-    """Return the pictures, named in PAGE_CAPTIONS, from which the page draws a material (H, W, 7).
+    """Return the pictures, named in PAGE_CAPTIONS, with which the page draws a material (H, W, 7).
 
-    The base colour and, in the red channel of `gloss`, the reflectance at normal incidence, usually
-    4 %, are encoded in sRGB. Roughness (green) and metalness (blue) are linear; the page shows each
-    of them as a gray picture.
+    The base colour is encoded in sRGB, and so is the red channel of `gloss`, the reflectance at
+    normal incidence, which is usually 4 %. Roughness (green) and metalness (blue) are linear; the
+    page shows each of them as a gray picture.
     """
     from splinecli.materials.lobes import F0_OF_SPECULAR
 

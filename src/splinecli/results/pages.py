@@ -1,4 +1,4 @@
-"""HTML pages of results: one for each capture, with relighting, and their index.html."""
+"""HTML pages of results: one page with relighting for each capture, and index.html."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def picture_url(file: bytes, kind: str = "png") -> str:
 
 
 def render(template: str, **values: object) -> str:
-    """Return the page rendered from a template and its values.
+    """Return the page rendered from a template and values.
 
     Values are escaped; a missing value is an error.
     """
@@ -48,13 +48,14 @@ def render(template: str, **values: object) -> str:
     return environment.get_template(template).render(version=__version__, **values).rstrip() + "\n"
 
 
-# pixels of the maps on a page; larger ones are reduced, so that browsers can open the file
+# largest number of pixels on a page, so that browsers can open the file; larger maps are reduced
 LARGEST_MAP = 8_000_000
-LONGEST_SIDE = 8192  # pixels: most devices can draw pictures up to this side length
-# below the 8 bits of a picture: 13 bits keep a normal within 0.01 degrees; more would be noise
+LONGEST_SIDE = 8192  # longest side in pixels that most devices can draw
+# bits in addition to the 8 bits of a picture: 13 bits represent a normal within 0.01 degrees, and
+# more would be noise
 LOW_BITS = 5
 _LARGEST_CODE = 2 ** (8 + LOW_BITS) - 1  # represents a component of 1
-_EDGE_SIGMA = 1.2  # pixels, of the mask's blur: rounds the steps of its outline
+_EDGE_SIGMA = 1.2  # width in pixels of the blur that smooths the outline of the mask
 _TIMES = "\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}"
 
 
@@ -68,13 +69,13 @@ def result_page(
     error_map_deg: Float32Array | None = None,
     pictures: Mapping[str, bytes] | None = None,
 ) -> str:
-    """Return one HTML file that contains everything it shows and loads nothing from a network.
+    """Return an HTML file that contains everything it shows and loads nothing from a network.
 
     Maps that exceed LARGEST_MAP or LONGEST_SIDE are reduced, keeping their aspect ratio, and the
-    page then states the reduced size. A pixel of a reduced map is the mean of the values in its
-    area that are in the mask (or have an error); mean normals are rescaled to unit length. The
-    figures on the page are taken from the report and cover all pixels. Raises OutputError if a
-    picture cannot be encoded.
+    page states the reduced size. A pixel of a reduced map is the mean of the values in its area
+    that are in the mask (or have an error); mean normals are rescaled to unit length. The figures
+    on the page come from the report and refer to all pixels. Raises OutputError if a picture cannot
+    be encoded.
 
     Args:
         report: a report of `infer` (docs/infer.md); `files` and `surface` may be missing. Lengths
@@ -82,11 +83,11 @@ def result_page(
             maps.
         normal_map: (H, W, 3), unit in the mask; x right, y up, z to the camera.
         mask: (H, W), not empty.
-        values: (H, W) or (H, W, C), by name, for the maps in MAPS that the page shows.
+        values: (H, W) or (H, W, C), by name, for the maps in MAPS that are on the page.
         material: (H, W, 7), see splinecli.results.material; determines how the page reflects light.
-            None for the albedo and a highlight that the reader sets.
+            If it is None, the page uses the albedo and a highlight that the reader can adjust.
         error_map_deg: (H, W) degrees, NaN where the error is unknown.
-        pictures: further pictures (PNG), each with its caption as the key.
+        pictures: further pictures (PNG) by caption.
     """
     normals, shown = _reduce(normal_map, mask, LARGEST_MAP)
     values = values or {}
@@ -148,10 +149,10 @@ def result_page(
 def split_normals(normals: Float32Array, mask: Bools) -> tuple[Picture, Picture]:
     """Return unit normals (H, W, 3) as two RGB pictures, of upper and lower bits.
 
-    They are the upper 8 bits of (n + 1) / 2, and the LOW_BITS below. The first is the usual picture
-    of a normal map, and is black outside the mask (H, W). A pixel that is black in it must be
-    outside, because no unit normal is near (-1, -1, -1). The upper bits of the second store the
-    blurred mask, of which no pixel crosses the level of 1/2: thin parts stay. The pictures have no
+    The first picture contains the upper 8 bits of (n + 1) / 2, like the usual picture of a normal
+    map. It is black outside the mask (H, W), and only there, because no unit normal is near (-1,
+    -1, -1). The second contains the LOW_BITS below and, in its upper bits, the blurred mask. To
+    keep thin parts, blurring does not move any pixel across the level of 1/2. The pictures have no
     alpha channel, because a browser would multiply the colours by it.
     """
     import cv2
@@ -184,10 +185,10 @@ def _first_pictures(
 
 
 def _reduce(values: Float32Array, known: Bools, largest: int) -> tuple[Float32Array, Bools]:
-    """Return values (H, W, C) and their mask, reduced in size.
+    """Return values (H, W, C) and their mask at a reduced size.
 
     The result has at most `largest` pixels, and sides of at most LONGEST_SIDE. A reduced value is
-    the mean of the known values in its area, and is known if one of them is.
+    the mean of the known values in its area, and is known if at least one of them is.
     """
     import cv2
 
@@ -197,7 +198,7 @@ def _reduce(values: Float32Array, known: Bools, largest: int) -> tuple[Float32Ar
         return values, known
     size = max(1, round(width * shrink)), max(1, round(height * shrink))
     weight = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)[..., None]
-    # OpenCV takes up to four
+    # Channels are reduced one by one, because OpenCV supports at most four.
     channels = (np.where(known, channel, 0) for channel in np.moveaxis(values, 2, 0))
     total = np.dstack([cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in channels])
     return np.divide(total, weight, out=np.zeros_like(total), where=weight > 0), weight[..., 0] > 0
@@ -211,10 +212,10 @@ def _size(mask: Bools) -> str:
 def _facts(report: Mapping[str, Any], reduced: str | None) -> list[tuple[str, str]]:
     """Return pairs of terms and values.
 
-    `reduced` is the size of the maps on the page if they were reduced.
+    If the maps on the page were reduced, `reduced` is their size.
     """
     weights, expected = report["weights"], report["expected_under_5"]
-    # up to this page
+    # excluding the time for this page and later stages
     stages = [(name, n) for name, n in report["seconds"].items() if n >= 0.05 and name != "total"]
     condition = "" if report["capture_judged"] else ", if the lights and the images are right"
     facts = [
@@ -242,7 +243,7 @@ INDEX = "index.html"
 
 
 class IndexRow(NamedTuple):
-    """One row of the overview, as text. A capture that failed has only its name and the error."""
+    """One row of the overview as text. A failed capture has only its name and the error."""
 
     capture: str
     lights: str = ""
@@ -260,7 +261,7 @@ HEADER = IndexRow(
 
 
 class IndexEntry(NamedTuple):
-    """The page's entry for one capture: its row, the names of its files, and its warnings."""
+    """A capture on the overview page: its row, the names of its files, and its warnings."""
 
     row: IndexRow
     files: tuple[str, ...] = ()
@@ -287,10 +288,12 @@ class IndexEntry(NamedTuple):
 
 
 def index_page(entries: Sequence[IndexEntry], output: Path) -> str:
-    """Return the overview page of the folder above the captures, with thumbnails and links."""
+    """Return the overview page for the folder that contains the results, with thumbnails and
+    links.
+    """
     rows = []
     for row, files, words in entries:
-        # Quote the bytes, because a folder's name may not be valid text.
+        # Quote the bytes, because the name of a folder may not be valid text.
         folder = quote(os.fsencode(row.capture))
         picture = next((name for name in (NORMALS["png8"], NORMALS["png"]) if name in files), None)
         shown = {**row._asdict(), "words": words, "page": None, "picture": None, "thumbnail": None}
@@ -305,14 +308,14 @@ def index_page(entries: Sequence[IndexEntry], output: Path) -> str:
 
 
 def _thumbnail(path: Path) -> str | None:
-    """Return a picture of at most 256 x 192 pixels as a JPEG data URL, or None if unreadable.
+    """Return a picture of at most 256 x 192 pixels as a JPEG data URL; None if it cannot be read.
 
-    This is twice its size on the page, for sharp screens.
+    On the page, it has half this size, to be sharp on high-resolution screens.
     """
     import cv2
 
     try:
-        # 33 megapixels of 16 bits; larger files may be decompression bombs.
+        # This is 33 megapixels of 16 bits. Larger files may be decompression bombs.
         if image_bytes(*read_header(path).size) > 10**9:
             return None
         picture = decode_image(path)
@@ -329,10 +332,7 @@ def _thumbnail(path: Path) -> str | None:
 
 
 def with_earlier(entries: Sequence[IndexEntry], folder: Path) -> list[IndexEntry]:
-    """Return the entries, followed by those of other captures with results in the folder.
-
-    The others are sorted by name.
-    """
+    """Return the entries, followed by other captures with results in the folder, sorted by name."""
     names = {entry.row.capture for entry in entries}
     earlier = []
     for path in sorted(folder.glob(f"*/{REPORT}")):
@@ -350,22 +350,23 @@ def with_earlier(entries: Sequence[IndexEntry], folder: Path) -> list[IndexEntry
 
 
 def has_index(folder: Path) -> bool:
-    """Return whether the folder has an index.html that splinecli wrote."""
+    """Return whether the folder contains an index.html written by splinecli."""
     with suppress(OSError):
         if (folder / INDEX).is_file():
             with (folder / INDEX).open("rb") as file:
-                # it is near the top
+                # The tag is near the top.
                 return b'<meta name="generator" content="splinecli">' in file.read(1 << 16)
     return False
 
 
 def check_index_free(folder: Path, *, overwrite: bool) -> None:
-    """Raise OutputError if the folder has an index.html that may not be replaced.
-
-    That is one which splinecli did not write.
+    """Raise OutputError if the folder contains an index.html from elsewhere, without
+    `overwrite`.
     """
     path = folder / INDEX
     if path.is_dir() or (path.exists() and not overwrite and not has_index(folder)):
         raise OutputError(
-            "was not written by splinecli", path=path, hint="Add --overwrite, or choose another -o"
+            "the file was not written by splinecli",
+            path=path,
+            hint="Add --overwrite, or choose another -o",
         )
