@@ -1,4 +1,4 @@
-"""The errors that splinecli raises on purpose. Each has an exit code and a hint with a remedy."""
+"""The errors that splinecli raises on purpose. Each has an exit code, and a hint with a remedy."""
 
 from collections.abc import Collection
 from difflib import get_close_matches
@@ -8,10 +8,10 @@ from typing import Any
 
 
 def printable(text: object) -> str:
-    """Return the text on one line, with escapes such as \\n for all non-printable characters.
+    """Return the text on one line, with escapes such as \\n for non-printable characters.
 
-    File names may contain any character, including control sequences that move the cursor or forge
-    a line.
+    File names may contain any character, including control sequences that move the cursor or
+    imitate a line.
     """
     return "".join(
         c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode()
@@ -20,7 +20,7 @@ def printable(text: object) -> str:
 
 
 class SplinecliError(Exception):
-    """A failure that one message explains: "PATH:LINE: PROBLEM. HINT.".
+    """A failure that is explained by a single message: "PATH:LINE: PROBLEM. HINT.".
 
     Args:
         problem: the value found and the value expected, as one sentence without the final full
@@ -86,10 +86,10 @@ class OutputError(SplinecliError):
     exit_code = 5
 
 
-def check_one_of(what: str, value: str, allowed: Collection[str]) -> None:
+def check_one_of(kind: str, value: str, allowed: Collection[str]) -> None:
     """Raise UsageError for a value that is not allowed."""
     if value not in allowed:
-        problem = f"no {what} named {value!r}; expected one of {', '.join(allowed)}"
+        problem = f"no {kind} named {value!r}; expected one of {', '.join(allowed)}"
         raise UsageError(problem, hint=did_you_mean(value, allowed))
 
 

@@ -96,7 +96,9 @@ def test_evaluate(unlit, run):
     (unlit / "light_intensities.txt").write_text("1\n" * len(LIGHTS))
     arguments = f"evaluate {unlit} --method ls --n-lights 8 --trials 2 --json -o scores"
     given = run(arguments).json
-    result = run(f"{arguments} --lights estimate", says="are wrong by")
+    result = run(
+        f"{arguments} --lights estimate", says="the mean error of the estimated light directions is"
+    )
     estimated = result.json
     check(estimated, "Results")
     assert given["results"][0]["found_light_error_deg"] is None

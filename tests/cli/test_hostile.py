@@ -163,7 +163,7 @@ def test_a_low_limit_on_memory_is_one_line(capture):
     for limit in (600_000, 1_100_000):
         result = shell(f"ulimit -v {limit}; {arguments}")
         assert result.returncode == 1
-        assert result.stderr.startswith("splinecli: the limit on the memory of this process is")
+        assert result.stderr.startswith("splinecli: the memory limit of this process is")
         assert result.stderr.count("\n") == 1
     assert not Path("out").exists()
 

@@ -167,7 +167,7 @@ def test_something_else_in_place_of_a_lock_fails_its_capture_only(inputs, run):
     for plant in (lambda path: path.symlink_to("/nowhere"), Path.mkdir, os.mkfifo):
         lock = Path("out/sphere/.lock")
         plant(lock)
-        message = "out/sphere/.lock: is not a file, so it cannot lock the folder. Remove it."
+        message = "out/sphere/.lock: the lock is not a file. Remove it."
         run("infer sphere second --method ls -o out --overwrite", code=5, says=message)
         assert Path("out/second/report.json").is_file() and Path("out/index.html").is_file()
         lock.rmdir() if lock.is_dir() else lock.unlink()

@@ -165,7 +165,7 @@ def test_a_damaged_log_is_kept_aside(run, no_pictures, damage):
     Path("run/metrics.csv").write_bytes(damaged)
     run(
         "train -o run --resume --steps 2",
-        says="splinecli: warning: metrics.csv was damaged and has been renamed to run/metrics.damaged.csv",
+        says="warning: metrics.csv was damaged and has been renamed to run/metrics.damaged.csv",
     )
     assert Path("run/metrics.damaged.csv").read_bytes() == damaged
     assert steps() == ["2"]

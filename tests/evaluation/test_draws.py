@@ -112,7 +112,10 @@ def test_a_long_draw_is_read(tmp_path):
         ("0 1 2\n4 5 4", ":2: light index 4 is listed twice. List each light once."),
         ("# two\n0 1", ":2: found 2 light indices, expected at least 3."),
         ("0 1 2\n0 1 2 3", ":2: found 4 light indices, expected 3 as in the first draw."),
-        ("# nothing\n", ": the file contains no draws, expected a line of light indices for each."),
+        (
+            "# nothing\n",
+            ": the file contains no draws, expected one line of light indices for each.",
+        ),
     ],
 )
 def test_a_wrong_draws_file(tmp_path, text, problem):

@@ -190,8 +190,8 @@ def test_a_limit_on_open_files(folder):
 
 
 BUSY = (
-    "splinecli: out/a: another splinecli process is writing into this folder. Wait for it to end,"
-    " or choose another -o.\n"
+    "splinecli: out/a: another splinecli process is writing to this folder. Wait until it is"
+    " finished, or choose another -o.\n"
 )
 
 

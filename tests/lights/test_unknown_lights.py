@@ -198,7 +198,7 @@ def test_python():
         (None, {"pixel_size": 1.0}, "near lamps need positions"),
         (true, {"first_light": "left"}, "first_light is for lights that are found"),
         (None, {"first_light": "north"}, "found 'north' as the side"),
-        (None, {"first_light": 400}, "first light comes from '400'"),
+        (None, {"first_light": 400}, "found '400' as the side"),
     ):
         with pytest.raises(UsageError, match=message):
             estimate_normals(images, lights_given, INSIDE, **options)

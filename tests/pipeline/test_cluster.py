@@ -112,7 +112,7 @@ def test_a_task_for_no_worker(client, work):
     finally:
         client.run(worker_tasks.set_resources, MEMORY=1000 * GB)
     assert str(results.pop(2)).startswith(
-        "big: it takes about 5.0 GB of memory, but the largest worker has 4.0 GB."
+        "big: it takes about 5.0 GB of memory, but the largest worker has only 4.0 GB."
     )
     assert results == {0: 0, 1: 2}
 
@@ -256,7 +256,7 @@ def test_a_capture_that_a_worker_does_not_see(client, tmp_path, monkeypatch):
         batch._infer, InferOptions(method="ls"), "nothing", None, 0, member, pure=False
     ).result()
     expected = (
-        rf"{tmp_path}/unseen: the folder does not exist on the worker tcp://[0-9.:]+\. Workers need"
+        rf"{tmp_path}/unseen: the folder does not exist on the worker tcp://[0-9.:]+\. Workers must"
     )
     assert re.match(expected, outcome.report["error"]) and outcome.exit_code == 3
 

@@ -81,10 +81,10 @@ def test_points_must_be_on_the_object_and_not_in_a_line():
     with pytest.raises(UsageError, match="the point 90,10 of --level is not on the object"):
         plane_slopes(heights, ((1, 1), (5, 5), (90, 10)))
     for points in (((1, 1), (5, 5), (20, 20)), ((5, 5), (5, 5), (5, 5))):
-        with pytest.raises(UsageError, match="the points of --level are in a line"):
+        with pytest.raises(UsageError, match="the points of --level are on one line"):
             plane_slopes(heights, points)
     for line in (heights[:1], heights[:, :1], heights[:1, :1]):
-        with pytest.raises(UsageError, match="the pixels of the object are in a line"):
+        with pytest.raises(UsageError, match="the pixels of the object are on one line"):
             plane_slopes(line)
 
 

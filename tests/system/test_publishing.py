@@ -228,9 +228,7 @@ def system(request, monkeypatch):
 def test_a_folder_is_held_by_one_at_a_time(tmp_path):
     with (
         locked(tmp_path / "run"),
-        pytest.raises(
-            BusyError, match="run: another splinecli process is writing into this folder"
-        ),
+        pytest.raises(BusyError, match="run: another splinecli process is writing to this folder"),
         locked(tmp_path / "run"),
     ):
         pytest.fail("two at once")

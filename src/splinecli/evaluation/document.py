@@ -1,4 +1,4 @@
-"""The files that an evaluation writes: results, tables, plots, and a report in HTML.
+"""The files that an evaluation writes: results, tables, plots, and an HTML report.
 
 All functions take one evaluation, or several with the same methods that differ in n_lights,
 light_noise_deg or both.
@@ -37,19 +37,20 @@ from splinecli.records.output_files import LIGHT_NOISE_PLOT, LIGHT_PLOT
 from splinecli.results.pages import picture_url, render
 from splinecli.system.publishing import new_files
 
-_MOST_SENTENCES = 3  # pairs, as with three methods; more pairs are easier to read in a matrix
+_MOST_SENTENCES = 3  # pairs of three methods; more pairs are easier to read in a matrix
 _MINUS = "\N{MINUS SIGN}"
 _RESTORED = (
     "lens blur removed, saturated observations restored, unknown light intensities estimated, as"
     " infer does"
 )
-_AS_STORED = "as stored: nothing restored, unknown light intensities taken to be equal"
+_AS_STORED = "as stored: nothing restored, unknown light intensities assumed to be equal"
 Mark = Literal["", "star", "best"]
 
 
 class Cell(NamedTuple):
-    """A table's cell: its text, a remark in smaller type, and a mark. "best" adds a star and a
-    colour.
+    """A cell of a table: its text, a remark in smaller type, and a mark.
+
+    "star" adds a star, and "best" a star and a colour.
     """
 
     text: str
@@ -65,7 +66,7 @@ def html_report(
 ) -> str:
     """Return the report of one evaluation, or of several with different lights or light noise.
 
-    `figures` are pairs of a caption, which also serves as alternative text, and a PNG. `notes` are
+    `figures` are pairs of a caption, which is also the alternative text, and a PNG. `notes` are
     sentences about the captures.
     """
     first, captures = evaluations[0], _captures(evaluations)
@@ -132,7 +133,7 @@ def _section(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def _summary(evaluations: Sequence[Evaluation]) -> Table:
-    """Return a table of methods by evaluations, the last columns of their tables."""
+    """Return a table of methods by evaluations, made of the last columns of their tables."""
     columns = [[Cell(name) for name in ("method", *evaluations[0].methods)]]
     for evaluation in evaluations:
         averages = [row[-1] for row in _error_table(evaluation)[1:]]
@@ -141,9 +142,9 @@ def _summary(evaluations: Sequence[Evaluation]) -> Table:
 
 
 def _error_table(evaluation: Evaluation) -> Table:
-    """Return a table of methods by captures, with the average: MAE and its standard deviation.
+    """Return a table of methods by captures and their average: the MAE and its standard deviation.
 
-    The deviation is over the trials.
+    The standard deviation is over the trials.
     """
     header, *rows = table_rows(evaluation)
     best = tables.best_cells([header, *rows])
@@ -241,7 +242,7 @@ TRIALS, REPORT, RESULTS, FIGURES = "trials.jsonl", "report.html", "results.json"
 def _make_plots(evaluations: Sequence[Evaluation]) -> dict[str, tuple[str, bytes]]:
     """Return plots of the error against each setting that varies, by file name.
 
-    Each has a caption and a PNG.
+    Each is a pair of a caption and a PNG.
     """
     plots: dict[str, tuple[str, bytes]] = {}
     if not set.intersection(*(set(evaluation.captures) for evaluation in evaluations)):
@@ -260,10 +261,10 @@ def write_results(
     figures: Sequence[CaptureFigure] | None,
     relit: Sequence[RelightingReport] | None = None,
 ) -> dict[str, Any]:
-    """Write all files, replacing an earlier evaluation (see new_files).
+    """Write all files, replacing an earlier evaluation (see new_files), and return results.json.
 
-    The caller has locked the folder. If `figures` is None, the figures of an earlier evaluation are
-    kept. Returns the content of results.json.
+    The caller must have locked the folder. If `figures` is None, the figures of an earlier
+    evaluation are kept.
     """
     document, plots = results_document(evaluations), _make_plots(evaluations)
     if relit is not None:
@@ -293,8 +294,8 @@ def results_document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     """Return the content of results.json. Degrees and seconds have four decimals.
 
     With several evaluations, `protocol` lists the values in which they differ, and `averages` has
-    an entry for each evaluation under each method, by the same values: {"ls": {"10": 16.1, "all":
-    15.4}}. p-values have three significant digits.
+    an entry for each evaluation under each method, named by these values: {"ls": {"10": 16.1,
+    "all": 15.4}}. p-values have three significant digits.
     """
     return {
         "schema": 1,
@@ -314,7 +315,7 @@ def results_document(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
 
 
 def results_csv(evaluations: Sequence[Evaluation]) -> str:
-    """Return a header and a line for each result, as in `results` of results.json."""
+    """Return a header and one line for each result, as in `results` of results.json."""
     text = io.StringIO()
     records = _records(evaluations)
     for record in records:
@@ -328,7 +329,7 @@ def results_csv(evaluations: Sequence[Evaluation]) -> str:
 def _as_text_cell(value: Any) -> Any:
     """Return a value as a one-line cell.
 
-    An apostrophe marks it as text if a spreadsheet could read it as a formula.
+    An apostrophe marks a text that a spreadsheet could interpret as a formula.
     """
     if not isinstance(value, str):
         return value
@@ -350,7 +351,7 @@ def _protocol_record(protocols: Sequence[Protocol]) -> dict[str, Any]:
 
 
 def _records(evaluations: Sequence[Evaluation]) -> list[dict[str, Any]]:
-    """Return the fields of MethodResult of each result, from the result or from its protocol."""
+    """Return the fields of MethodResult for each result, taken from the result or its protocol."""
     names = MethodResult.__struct_fields__
     pairs = [(result, e.protocol) for e in evaluations for result in e.results]
     return [
@@ -365,7 +366,7 @@ def _averages(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     averages = [_rounded(e.averages) for e in evaluations]
     if len(evaluations) == 1:
         return averages[0]
-    # The values that differ between the evaluations: "10", "all"; "0", "2.5"; or both, "10, 2.5".
+    # Keys are the values that differ between evaluations, such as "10", "2.5" or "10, 2.5".
     lights = [str(lights_value(e.protocol)) for e in evaluations]
     noise = [f"{e.protocol.light_noise_deg:g}" for e in evaluations]
     differing = [values for values in (lights, noise) if len(set(values)) > 1] or [lights]
@@ -378,7 +379,8 @@ def _averages(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
 
 
 def _rounded(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values with degrees and seconds to four decimals; the light noise is as given.
+    """Return values with degrees and seconds rounded to four decimals; the light noise is
+    unchanged.
 
     p-values span many orders of magnitude, so they have three significant digits.
     """

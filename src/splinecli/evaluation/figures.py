@@ -1,9 +1,9 @@
 """Figures of evaluations: the error against a setting, maps and observation maps of single
 captures, and relighting.
 
-Curves show only the captures that all evaluations scored, so that every point of an average covers
-the same captures. Relighting compares photographs under lights that a draw leaves out with pictures
-of the material estimated from the others.
+Curves include only the captures that all evaluations scored, so that all points of an average refer
+to the same captures. Relighting compares photographs under lights that are not in a draw with
+pictures of the material estimated from the draw.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-# with a panel each. With more, only the average is plotted, to keep the figure legible
+# Up to this number, each capture has a panel. With more, only the average is plotted.
 MOST_CAPTURES = 4
 _PANEL_INCHES = (3.2, 2.7)
-_SMALL, _LARGE = 8, 9  # points: the text of a paper's figure
-# matplotlib's dashes: an offset, then lengths of ink and gaps in line widths
+_SMALL, _LARGE = 8, 9  # font sizes in points, as in the figures of papers
+# Dashes for matplotlib: an offset, then lengths of dashes and gaps in line widths
 _DASHES: tuple[tuple[float, tuple[float, ...]], ...] = (
     (0, ()),
     (0, (4, 2)),
@@ -54,10 +54,10 @@ _DASHES: tuple[tuple[float, tuple[float, ...]], ...] = (
 def lights_curves(evaluations: Sequence[Evaluation]) -> bytes:
     """Return a PNG of the error against the number of lights K, on a logarithmic axis.
 
-    Each capture has a panel, and so does their average; with one capture, or more than
+    Each capture has a panel, and so does their average. With one capture, or more than
     MOST_CAPTURES, only the average has a panel. "all" is plotted at the capture's number of lights,
-    and in the panel of the average at the mean number. If the light noise also varies, each of its
-    values has its own dash pattern.
+    and in the panel of the average at the mean number. If the light noise also varies, each value
+    has its own dash pattern.
     """
     return _curves(
         evaluations,
@@ -72,7 +72,7 @@ def lights_curves(evaluations: Sequence[Evaluation]) -> bytes:
 
 
 def light_noise_curves(evaluations: Sequence[Evaluation]) -> bytes:
-    """Return a PNG of the error against the light noise, with the panels of lights_curves.
+    """Return a PNG of the error against the light noise, with the same panels as lights_curves.
 
     If the number of lights also varies, each number has its own dash pattern.
     """
@@ -95,12 +95,12 @@ def _curves(
     label: str,
     logarithmic: bool,
 ) -> bytes:
-    """Return the panels side by side as PNG, with one curve for each method and series, and one
-    legend for all.
+    """Return a PNG of panels side by side, with one curve for each method and series, and one
+    legend.
 
     Each curve has a band of one standard deviation on either side. Its colour and marker indicate
-    the method, its dashes the series. `x` returns an evaluation's position on a capture's x axis,
-    `tick` the label there, and `series` the name of its curves.
+    the method, and its dashes the series. `x` returns the position of an evaluation on the x axis
+    of a capture, `tick` its label there, and `series` the name of its series.
     """
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
@@ -151,7 +151,7 @@ def _curves(
         axes.set_ylim(bottom=0)
         axes.tick_params(labelsize=_SMALL)
         axes.grid(alpha=0.3)
-    handles = [  # a dollar sign would begin a formula
+    handles = [  # a dollar sign would start a formula
         Line2D(
             [],
             [],
@@ -173,8 +173,9 @@ def _curves(
 
 
 def _error(evaluation: Evaluation, method: str, capture: str) -> tuple[float, float]:
-    """Return the mean error of a method on a capture or the average, and its standard deviation
-    over the trials.
+    """Return the mean error of a method on a capture or the average, and its standard deviation.
+
+    The standard deviation is over the trials.
     """
     if capture == AVERAGE:
         return evaluation.averages[method], float(np.std(trial_averages(evaluation, method)))
@@ -183,9 +184,7 @@ def _error(evaluation: Evaluation, method: str, capture: str) -> tuple[float, fl
 
 
 def _set_ticks(axes: Axes, ticks: dict[float, str], *, logarithmic: bool) -> None:
-    """Set ticks at the points, in ascending order. A label that would overlap the previous one is
-    left out.
-    """
+    """Set ticks at the points, in ascending order, and leave out labels that would overlap."""
     from matplotlib.ticker import NullLocator
 
     if logarithmic:
@@ -194,7 +193,7 @@ def _set_ticks(axes: Axes, ticks: dict[float, str], *, logarithmic: bool) -> Non
     span = max(place.values()) - min(place.values())
     labels, last = [], -math.inf
     for x, position in place.items():
-        # fraction of the axis; labels closer than this would overlap
+        # Labels closer than this fraction of the axis would overlap.
         fits = position - last > 0.045 * span
         labels.append(ticks[x] if fits else "")
         last = position if fits else last
@@ -202,7 +201,8 @@ def _set_ticks(axes: Axes, ticks: dict[float, str], *, logarithmic: bool) -> Non
     axes.xaxis.set_minor_locator(NullLocator())
 
 
-SHOWN_PERCENTILES = (10, 50, 90, 99)  # of SPLINE-Net's errors, at which pixels are shown by default
+# Percentiles of SPLINE-Net's errors, whose pixels are shown by default
+SHOWN_PERCENTILES = (10, 50, 90, 99)
 MAPS = "_observation_maps"
 
 
@@ -223,14 +223,14 @@ def capture_figures(
     pixels: Sequence[tuple[int, int]],
     advance: Callable[[float], object],
 ) -> list[CaptureFigure]:
-    """Return a figure of the methods' maps for the protocol's first draw and, with SPLINE-Net, one
-    of single pixels.
+    """Return a figure of the methods' maps for the protocol's first draw, and one of single pixels.
 
-    The figure of single pixels, (row, column) or those at SHOWN_PERCENTILES, is omitted under near
-    lamps or with a camera matrix. All pixels in the mask are estimated, even if the protocol has
-    max_pixels. `name` is the capture's in the tables, and `stem` is the stem of the files.
-    `advance` is called with the fraction of the work just completed. Raises InputError if the
-    capture cannot be read or scored, or UsageError if a pixel has no ground truth.
+    The figure of single pixels needs SPLINE-Net, and is omitted under near lamps or with a camera
+    matrix. Its pixels are given as (row, column), or are those at SHOWN_PERCENTILES. All pixels in
+    the mask are estimated, even if the protocol has max_pixels. `name` is the capture's name in the
+    tables, and `stem` is the stem of the files. `advance` is called with the fraction of the work
+    just completed. Raises InputError if the capture cannot be read or scored, or UsageError if a
+    pixel has no ground truth.
     """
     steps = 1 + len(estimators)
     stored, capture = read_first_draw(folder, name, protocol, lambda share: advance(share / steps))
@@ -246,7 +246,7 @@ def capture_figures(
             estimate.normal_map,
             estimate.error_map_deg,
         )
-    # The largest number of lights listed in a title.
+    # At most 16 lights are listed in a title.
     listed = f" ({', '.join(map(str, capture.light_indices))})" if capture.n_lights <= 16 else ""
     title = f"{printable(name)}, {heading(protocol)}{listed}"
     png = method_maps(capture.ground_truth, capture.mask, normals, errors_deg, title=title)
@@ -264,13 +264,13 @@ def capture_figures(
         png = _observation_maps(
             whole, capture, network, errors_deg[network.name], pixels, title=title
         )
-        caption = f"{title}. Observation maps of single pixels, turned into the network's frame."
+        caption = f"{title}. Observation maps of single pixels, rotated to the network's frame."
         figures.append(CaptureFigure(f"{stem}{MAPS}", caption, png))
     return figures
 
 
 def file_stems(names: Sequence[str]) -> list[str]:
-    """Return a unique file name stem for each capture, even if the names contain slashes."""
+    """Return a unique stem of file names for each capture, even if the names contain slashes."""
     stems: list[str] = []
     taken: set[str] = set()
     for name in names:
@@ -300,7 +300,10 @@ def _observation_maps(
             problem = (
                 f"the pixel in row {row}, column {column} of {capture.name} has no ground truth"
             )
-            hint = "Name pixels on the object, rows from the top and columns from the left, from 0"
+            hint = (
+                "Choose pixels on the object, counting rows from the top and columns from the left,"
+                " from 0"
+            )
             raise UsageError(problem, hint=hint)
     rows, columns = np.array(pixels).T if pixels else np.nonzero(np.isfinite(errors_deg))
     if not pixels:
@@ -335,12 +338,12 @@ def relight_first_draw(
     protocol: Protocol,
     advance: Callable[[float], object],
 ) -> RelightingReport:
-    """Return how well the material estimated from the protocol's first draw predicts the
-    photographs under the other lights.
+    """Return how well the material predicts the photographs under the lights not in the first draw.
 
-    `name` is the capture's in the tables, and `advance` is called with the fraction of the images
-    just read. Raises UsageError if no light is left, or the lamps or the camera are near;
-    InputError if the capture cannot be read, or too few lights are used.
+    The material is estimated from the protocol's first draw. `name` is the capture's name in the
+    tables, and `advance` is called with the fraction of the images just read. Raises UsageError if
+    no light is left, or if the lamps or the camera are near; InputError if the capture cannot be
+    read, or if there are too few lights.
     """
     from splinecli.materials.maps import lights_that_reach, render_gray
 
@@ -387,8 +390,8 @@ def likeness(photographs: Float32Array, pictures: Float32Array) -> Likeness:
 
 
 def lambertian(given: Capture, normals: Float32Array, lights: Floats) -> Float32Array:
-    """Return pictures (P, F) of a matte surface under lights (F, 3), with the albedo that `infer`
-    computes.
+    """Return pictures (P, F) of a matte surface under lights (F, 3), with the albedo computed by
+    `infer`.
     """
     cosines = (normals @ given.light_directions.T).astype(np.float32)
     weights = agreeing_lights(given.observations, cosines) * cosines

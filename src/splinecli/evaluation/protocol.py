@@ -1,6 +1,5 @@
-"""The protocol of an evaluation and its outcome.
-
-It has draws of lights, trials, noise, pixels, and how captures are read.
+"""The protocol of an evaluation (draws of lights, trials, noise, pixels, and how captures are read)
+and its outcome.
 """
 
 import math
@@ -21,14 +20,14 @@ from splinecli.maths.robust import MIN_LIGHTS
 from splinecli.recipe.work import RecipeOptions
 from splinecli.records.documents import SkippedCapture
 
-# Of the seeds: noise and choice of pixels are independent of each other and of the draws
-# (DRAWS_STREAM).
+# Streams of the seed. The noise and the choice of pixels are independent of each other and of the
+# draws (DRAWS_STREAM).
 NOISE_STREAM, PIXELS_STREAM = 2, 3
 
 
 @dataclass(frozen=True)
 class DrawsFile:
-    """The draws in a file, all with the same number of lights."""
+    """The draws in a file, which all have the same number of lights."""
 
     path: Path
     draws: tuple[Draw, ...]
@@ -39,21 +38,24 @@ class DrawsFile:
         return len(self.draws[0])
 
     def check_against(self, light_directions: Float64Array, *, skipped: int = 0) -> None:
-        """Raise InputError for a draw that does not fit a capture under these lights (F, 3).
+        """Raise InputError, with the line, for a draw that does not fit a capture with these lights
+        (F, 3).
 
-        The error has the line number. Draws must not include the first `skipped` lights.
+        Draws must not include the first `skipped` lights.
         """
         available = len(light_directions)
         for draw, line in zip(self.draws, self.lines, strict=True):
             if max(draw) >= available:
-                problem = f"found light index {max(draw)}, expected 0 to {available - 1}"
-                problem += f": the capture has {available} lights"
+                problem = f"found light index {max(draw)}, expected 0 to {available - 1},"
+                problem += f" because the capture has {available} lights"
             elif min(draw) < skipped:
                 problem = (
-                    f"found light index {min(draw)}; the first {skipped} images are to be skipped"
+                    f"found light index {min(draw)}, but the first {skipped} images are skipped"
                 )
             elif in_one_plane(light_directions[list(draw)]):
-                problem = "the lights of this draw are in one plane, so no normal can be found"
+                problem = (
+                    "the lights of this draw are in one plane, so normals cannot be determined"
+                )
             else:
                 continue
             raise InputError(problem, path=self.path, line=line)
@@ -63,9 +65,9 @@ def read_draws(path: Path) -> DrawsFile:
     """Return the draws in a text file.
 
     Each line is one draw: zero-based light indices separated by spaces or commas. "#" comments and
-    blank lines are skipped. Raises InputError, with the line number, for a word that is not a light
-    index, a repeated index, fewer than three lights, or a number of lights that differs from the
-    first draw; also for a file without draws.
+    blank lines are skipped. Raises InputError with the line for a word that is not a light index, a
+    repeated index, fewer than three lights, or another number of lights than in the first draw;
+    also for a file without draws.
     """
     draws, lines = list[Draw](), list[int]()
     for line, text in enumerate(read_lines(path), start=1):
@@ -75,7 +77,7 @@ def read_draws(path: Path) -> DrawsFile:
             lines.append(line)
     if not draws:
         raise InputError(
-            "the file contains no draws, expected a line of light indices for each", path=path
+            "the file contains no draws, expected one line of light indices for each", path=path
         )
     return DrawsFile(path, tuple(draws), tuple(lines))
 
@@ -110,29 +112,29 @@ def _read_draw(words: list[str], n_lights: int, path: Path, line: int) -> Draw:
     return draw
 
 
-EVERY_CAPTURE = "*"  # key in `skip_first` for all captures without their own key
+EVERY_CAPTURE = "*"  # key in `skip_first` for all captures without a key of their own
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """Settings of an evaluation. Two methods are comparable only under the same protocol.
+    """The settings of an evaluation. Methods are only comparable under the same protocol.
 
-    Raises UsageError if a value is out of its range.
+    Raises UsageError if a value is out of range.
     """
 
-    # in each draw; None for all. A draws file overrides this field and trials
+    # number of lights in each draw; None for all. A draws file overrides this field and trials
     n_lights: int | None = None
-    # the number of random draws. Without light noise, a draw of all lights needs only one trial.
+    # number of random draws. Without light noise, a draw of all lights needs only one trial
     trials: int = 1
     seed: int = 0  # for the draws, the light noise and the choice of pixels
-    draws_file: Path | None = None  # file that provides the draws instead; see read_draws
+    draws_file: Path | None = None  # file that contains the draws; see read_draws
     # standard deviation of the angle by which each trial tilts the light directions
     light_noise_deg: float = 0.0
-    # to score in each capture, chosen at random; None for all with ground truth
+    # number of random pixels to score in each capture; None for all with ground truth
     max_pixels: int | None = None
-    # images, by the name of the capture or EVERY_CAPTURE
+    # number of images to skip, by the name of the capture or EVERY_CAPTURE
     skip_first: Mapping[str, int] = field(default_factory=dict)
-    # whether the stored values are scored, as in published tables, or read as in `infer`
+    # whether stored values are used, as for published tables, or restored ones, as in `infer`
     as_stored: bool = False
     white_level: float | None = None
     # typical error with which trials refine the lights (see refine_capture)
@@ -151,7 +153,7 @@ class Protocol:
 
     @property
     def recipe(self) -> RecipeOptions:
-        """How the recipe prepares the capture of a trial, whose lights need no checks."""
+        """How the recipe prepares the capture of a trial. The lights need no checks."""
         return RecipeOptions(
             as_stored=self.as_stored,
             finds_lights=self.finds_lights,
@@ -169,7 +171,7 @@ def lights_value(protocol: Protocol) -> int | Literal["all"]:
 def heading(protocol: Protocol) -> str:
     """Return the settings that differ between evaluations, such as "10 lights".
 
-    With noise: "all lights, light noise of 2 degrees".
+    With noise, this is for example "all lights, light noise of 2 degrees".
     """
     noise = (
         f", light noise of {protocol.light_noise_deg:g} degrees" if protocol.light_noise_deg else ""
@@ -178,15 +180,15 @@ def heading(protocol: Protocol) -> str:
 
 
 def protocol_in_words(protocol: Protocol) -> str:
-    """Return the whole protocol as text: "10 lights, 20 random draws, seed 0, images restored"."""
+    """Return the protocol as text, such as "10 lights, 20 random draws, seed 0, images
+    restored".
+    """
     parts = [heading(protocol)]
     if protocol.draws_file is not None:
         parts.append(f"the {protocol.trials} draws of {protocol.draws_file.name}")
     elif protocol.n_lights is not None:
         parts.append(f"{protocol.trials} random {'draw' if protocol.trials == 1 else 'draws'}")
-    elif (
-        protocol.light_noise_deg
-    ):  # without noise, all lights need one trial, regardless of the number given
+    elif protocol.light_noise_deg:  # without noise, all lights need only one trial
         parts.append(f"{protocol.trials} {'trial' if protocol.trials == 1 else 'trials'}")
     parts.append(f"seed {protocol.seed}")
     if protocol.max_pixels is not None:
@@ -208,10 +210,10 @@ class Result:
     method: str
     capture: str  # name of the capture in the tables
     n_lights: int  # number of lights in each draw
-    # mean angular error (MAE) over the scored pixels, in degrees, of each trial
+    # mean angular error (MAE) of each trial over the scored pixels, in degrees
     maes_deg: tuple[float, ...]
     seconds: float  # mean time to estimate the normals in a trial
-    # mean error of light directions that the trials estimated
+    # mean error of the light directions that were estimated in the trials
     found_light_error_deg: float | None = None
 
     @property
@@ -233,11 +235,11 @@ class Result:
 class Evaluation:
     """The outcome of one protocol."""
 
-    protocol: Protocol  # the protocol; n_lights and trials are taken from the draws file, if given
-    # one per capture and method, ordered by capture as given, then by method
+    protocol: Protocol  # with n_lights and trials from the draws file, if there is one
+    # one for each capture and method, in the order of the captures, then of the methods
     results: tuple[Result, ...]
     skipped: tuple[SkippedCapture, ...] = ()  # the captures that could not be scored
-    notes: tuple[str, ...] = ()  # sentences about the captures and how the evaluation treated them
+    notes: tuple[str, ...] = ()  # sentences about the captures and how they were treated
     # "weights", "device", "precision" and "fingerprint" of each method by name; see Estimator
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
@@ -251,9 +253,8 @@ class Evaluation:
 
     @property
     def averages(self) -> dict[str, float]:
-        """Mean of mae_deg over the captures, by method.
-
-        Every method has a result for every capture.
+        """The mean of mae_deg over the captures, by method. Every method has a result for every
+        capture.
         """
         return {
             method: math.fsum(r.mae_deg for r in self.results if r.method == method)
@@ -263,7 +264,7 @@ class Evaluation:
 
 
 def all_skipped(evaluations: Sequence[Evaluation]) -> list[SkippedCapture]:
-    """Return the captures skipped by any of the evaluations; repeated reasons are listed once."""
+    """Return the captures skipped by any of the evaluations, each with a reason only once."""
     return list(
         {(each.capture, each.reason): each for e in evaluations for each in e.skipped}.values()
     )

@@ -56,7 +56,7 @@ class ProtocolTrials:
     notes: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def fail(self, capture: str, error: SplinecliError) -> None:
-        """Record why a capture cannot be scored, and drop its trials."""
+        """Record why a capture cannot be scored, and remove its trials."""
         self.failures.setdefault(capture, error)
         self.trials = {key: trials for key, trials in self.trials.items() if key[0] != capture}
 
@@ -91,7 +91,9 @@ class ProtocolTrials:
                 else InputError
             )
             first = str(failures[0]).removesuffix(".")
-            raise kind(f"none of the {len(failures)} captures could be scored; the first: {first}")
+            raise kind(
+                f"none of the {len(failures)} captures could be scored; the first error is: {first}"
+            )
         skipped = (
             SkippedCapture(capture=name, reason=str(self.failures[name]))
             for name in captures
@@ -99,14 +101,13 @@ class ProtocolTrials:
         )
         notes = [note for name in captures for note in self.notes.get(name, ())]
         notes += [
-            f"{name}: no file gives the light intensities; they were estimated in {count} of {of}"
-            " trials."
+            f"{name}: the light intensities were estimated in {count} of {of} trials, because no"
+            " file contains them."
             for name, (count, of) in n_estimated.items()
             if count
         ]
         notes += [
-            f"{name}: the estimated light directions are wrong by {error_deg:.2f} degrees on"
-            " average."
+            f"{name}: the mean error of the estimated light directions is {error_deg:.2f} degrees."
             for name, error_deg in light_errors_deg.items()
             if error_deg is not None
         ]
@@ -115,9 +116,7 @@ class ProtocolTrials:
 
 @dataclass
 class CaptureJob:
-    """An open capture with the protocols that can score it and, for each draw,
-    the missing trials.
-    """
+    """An open capture with the protocols that can score it and the missing trials of each draw."""
 
     source: CaptureSource
     reading: CaptureReading
@@ -140,11 +139,9 @@ def plan_capture(
     tasks: Sequence[ProtocolTrials],
     store: TrialStore,
 ) -> CaptureJob | None:
-    """Add the trials of a capture to the tasks, and return the trials that are not in the store as
-    a job.
+    """Add the trials of a capture to the tasks, and return a job with the trials not in the store.
 
-    If no protocol can score the capture, the result is None, and the reasons are recorded in the
-    tasks.
+    If no protocol can score the capture, return None and record the reasons in the tasks.
     """
     try:
         source = open_to_score(folder, tasks[0].protocol)
@@ -156,8 +153,8 @@ def plan_capture(
         digest([__version__, estimator.fingerprint, *source.stamp]) for estimator in estimators
     ]
     able: list[ProtocolTrials] = []
-    # Group all methods of a draw, because they share its capture, and because the remaining time
-    # can then be estimated.
+    # The methods of a draw are grouped, because they share its capture, and so that the remaining
+    # time can be estimated.
     draws: list[list[Trial]] = []
     for task in tasks:
         try:
@@ -177,7 +174,7 @@ def plan_capture(
     missing = [
         left for draw in draws if (left := [trial for trial in draw if store.find(trial) is None])
     ]
-    needed = missing or draws[:1]  # the notes on the capture require its mask and its ground truth
+    needed = missing or draws[:1]  # the notes need the capture's mask and its ground truth
     protocols = tuple(task.protocol for task in able)
     methods = {trial.method for draw in needed for trial in draw}
     whole = any(
@@ -186,14 +183,13 @@ def plan_capture(
     whole = whole or any(
         estimator.needs_capture for estimator in estimators if estimator.name in methods
     )
-    seen = sorted({light for draw in needed for light in draw[0].lights})
-    return CaptureJob(
-        source, CaptureReading(folder, name, protocols, tuple(seen), whole), able, missing
-    )
+    used = tuple(sorted({light for draw in needed for light in draw[0].lights}))
+    return CaptureJob(source, CaptureReading(folder, name, protocols, used, whole), able, missing)
 
 
 def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
-    """Return the protocol, with n_lights and trials taken from its draws file, and the draws.
+    """Return the protocol, with n_lights and trials from its draws file, and the draws.
+
     Raises InputError.
     """
     if protocol.draws_file is None:
@@ -205,11 +201,12 @@ def read_draws_file(protocol: Protocol) -> tuple[Protocol, DrawsFile | None]:
 def draws_for(
     source: CaptureSource, name: str, protocol: Protocol, draws_file: DrawsFile | None
 ) -> list[Draw]:
-    """Return the draws of a capture, one for each trial. Raises InputError or UsageError if it does
-    not fit.
+    """Return the draws of a capture, one for each trial.
+
+    Raises InputError or UsageError if the protocol does not fit the capture.
     """
     if source.files.ground_truth is None:  # known before the images are read
-        hint = "Put a normal map into the folder, such as normal_gt.png or Normal_gt.mat"
+        hint = "Add a normal map to the folder, such as normal_gt.png or Normal_gt.mat"
         raise InputError("the capture has no ground truth", path=source.files.folder, hint=hint)
     near = source.lamps is not None and source.lamps.used
     if protocol.light_error_deg is not None:
@@ -260,8 +257,8 @@ def read_first_draw(
 def distinct_names(captures: Sequence[Path]) -> dict[Path, str]:
     """Return the folders, without duplicates, with the names of the captures.
 
-    If two names are equal, or one is the name of the average in the tables, all are the last parts
-    of their paths.
+    If two names are equal, or one is used for the average in the tables, all names are extended to
+    the last parts of their paths.
     """
     folders = list({folder.resolve(): folder for folder in captures}.values())
     names = [capture_name(folder) for folder in folders]
@@ -276,15 +273,16 @@ def distinct_names(captures: Sequence[Path]) -> dict[Path, str]:
 
 
 class DrawTask(NamedTuple):
-    """One draw of a capture: its trials, and the data read for all draws. Without trials, only
-    notes are returned.
+    """One draw of a capture: its trials, and the data for all draws of the capture.
+
+    Without trials, only notes are returned.
     """
 
     reading: CaptureReading
     trials: Sequence[Trial]
 
 
-# The score of each trial of a draw and the notes on its capture, or the reason that the capture
+# The scores of the trials of a draw and the notes on its capture, or the reason why the capture
 # cannot be scored
 Scored = tuple[Sequence[Score], Notes] | SplinecliError
 # Scores draws in other processes, and yields each draw with its scores as it finishes
@@ -303,11 +301,11 @@ def evaluate_all(
     elsewhere: Elsewhere | None = None,
     on_progress: OnProgress = lambda share, note: None,
 ) -> list[Evaluation]:
-    """Score every estimator on every capture under every protocol. None may be empty, and names
-    must be unique.
+    """Score every estimator on every capture under every protocol, and return the evaluations.
 
-    A capture that cannot be read, or has no ground truth or too few lights, is skipped, and the
-    outcome contains the reason. See distinct_names for the names of captures.
+    There must be at least one of each, with unique names. A capture that cannot be read, or has no
+    ground truth or too few lights, is skipped, and the evaluation contains the reason. For the
+    names of captures, see distinct_names.
 
     Args:
         store: where finished trials are stored; trials in the store are not computed again.
@@ -317,8 +315,8 @@ def evaluate_all(
 
     Raises:
         UsageError: skip_first names a capture that does not exist.
-        InputError: the draws file is invalid, or no capture could be scored; a single capture's own
-            error is raised.
+        InputError: the draws file is invalid, or no capture could be scored; for a single capture,
+            its own error is raised.
         SplinecliError: a method returned normals that are not unit vectors.
         OutputError: the store cannot be written.
     """
@@ -328,7 +326,7 @@ def evaluate_all(
     for protocol in protocols:
         for name in set(protocol.skip_first) - {EVERY_CAPTURE, *names}:
             raise UsageError(
-                f"no capture named {name!r} to skip images of; there are {', '.join(names)}"
+                f"--skip-first names the capture {name!r}, expected one of {', '.join(names)}"
             )
     store = TrialStore() if store is None else store
     planned = [
@@ -368,7 +366,7 @@ def _score_here(
     workers: ThreadPoolExecutor,
     jobs: int,
 ) -> None:
-    """Score `jobs` trials at a time in threads. Errors from trials are passed on."""
+    """Score `jobs` trials at a time in threads. Errors of trials are raised."""
 
     def score(shared: SharedDraw, trial: Trial) -> None:
         store.add(trial, shared.score(trial, estimators[trial.method], progress.begin))
@@ -387,7 +385,7 @@ def _score_here(
             shared = SharedDraw(source)
             for trial in draw:
                 running.add(workers.submit(score, shared, trial))
-                running = _wait(running, jobs)  # one trial waits, so that no core is idle
+                running = _wait(running, jobs)  # one further trial waits, so that no core is idle
             del shared
         del source  # before the next capture is read
     _wait(running, 0)
@@ -396,7 +394,7 @@ def _score_here(
 def _score_elsewhere(
     captures: Sequence[CaptureJob], elsewhere: Elsewhere, store: TrialStore, progress: _Progress
 ) -> None:
-    """Score the trials in other processes. Errors from trials are passed on."""
+    """Score the trials in other processes. Errors of trials are raised."""
     jobs = {job.reading.name: job for job in captures}
     for task, scored in elsewhere(
         [DrawTask(job.reading, draw) for job in captures for draw in job.draws or [[]]]
@@ -443,8 +441,8 @@ class _Progress:
 
 
 def _wait(running: set[Future[None]], at_most: int) -> set[Future[None]]:
-    """Wait until at most this many trials are running, and return them. Errors from finished trials
-    are passed on.
+    """Wait until at most this many trials are running, and return them. Errors of trials are
+    raised.
     """
     while len(running) > at_most:
         finished, running = wait(running, return_when=FIRST_COMPLETED)
@@ -455,8 +453,8 @@ def _wait(running: set[Future[None]], at_most: int) -> set[Future[None]]:
 
 @contextmanager
 def _share_cores(jobs: int) -> Iterator[None]:
-    """Limit PyTorch to a share of the cores for each of `jobs` parallel trials. This does not
-    import PyTorch.
+    """Limit PyTorch to a share of the cores for each of `jobs` parallel trials, without importing
+    it.
     """
     torch = sys.modules.get("torch")
     if torch is None or jobs == 1:

@@ -1,12 +1,12 @@
-"""Tests of whether methods differ by more than the draws of lights explain, and tables for people.
+"""Significance tests for differences between methods, and tables for people.
 
-All methods are given the same draws, and a draw that is hard for one method is usually hard for the
-others. The test therefore uses the differences trial by trial: a paired t-test (Student, Biometrika
-1908), corrected for the number of pairs of methods on one capture (Holm, Scandinavian Journal of
-Statistics 1979). The test covers only the variation between draws. A significant difference
-generalises to other lights on this capture, not to other captures.
+All methods are given the same draws of lights, and a draw that is hard for one method is usually
+hard for the others. Therefore, the test uses the differences trial by trial: a paired t-test
+(Student, Biometrika 1908), corrected for the number of pairs of methods on one capture (Holm,
+Scandinavian Journal of Statistics 1979). It covers only the variation between draws. A significant
+difference generalises to other lights on the same capture, but not to other captures.
 
-The tables are Markdown, LaTeX, and rows for a terminal. Their functions take one evaluation, or
+The tables are in Markdown, LaTeX, and rows for a terminal. Their functions take one evaluation, or
 several with the same methods that differ in n_lights, light_noise_deg or both.
 """
 
@@ -28,9 +28,9 @@ _SAME_DEG = 1e-6  # error maps are float32, so MAEs closer than this are conside
 
 
 def compare(evaluation: Evaluation) -> list[ComparisonReport]:
-    """Compare every pair of methods on every capture, then on the average over the captures.
+    """Return comparisons of every pair of methods, on every capture and on average.
 
-    Trial t of the average is the mean of trial t over the captures. See trial_averages.
+    Trial t of the average is the mean of trial t over the captures; see trial_averages.
     """
     errors = {
         name: {r.method: r.maes_deg for r in evaluation.results if r.capture == name}
@@ -49,8 +49,8 @@ def compare(evaluation: Evaluation) -> list[ComparisonReport]:
 def trial_averages(evaluation: Evaluation, method: str) -> tuple[float, ...]:
     """Return the MAE of a method in degrees for each trial, averaged over the captures.
 
-    If a capture has only one trial, for example because it has just K lights, that trial is
-    repeated. If the numbers of trials differ otherwise, only the trials common to all captures are
+    If a capture has only one trial, for example because it has just K lights, this trial is
+    repeated. If the numbers of trials differ otherwise, only the trials that all captures have are
     averaged.
     """
     maes_deg = [result.maes_deg for result in evaluation.results if result.method == method]
@@ -65,7 +65,7 @@ def comparison_in_words(c: ComparisonReport) -> str:
     size = f"{abs(c.difference_deg):.2f} degrees"
     if c.interval_deg is None or c.p_holm is None:
         reason = "one trial" if c.trials == 1 else f"the same in all {c.trials} trials"
-        return f"{better} scores {size} less than {worse} ({reason}: not tested)."
+        return f"{better} scores {size} less than {worse} (not tested, {reason})."
     test = f"{p_in_words(c.p_holm)}, {c.trials} trials"
     low, high = c.interval_deg
     if c.differs:
@@ -80,7 +80,7 @@ def comparison_in_words(c: ComparisonReport) -> str:
 
 
 def p_in_words(p_value: float) -> str:
-    """Return a p-value as text: "p < 0.001", "p = 0.032"."""
+    """Return a p-value as text, such as "p < 0.001" or "p = 0.032"."""
     return (
         "p < 0.001"
         if p_value < 0.001
@@ -115,7 +115,9 @@ def _compare_all(maes_deg: dict[str, tuple[float, ...]], **settings: Any) -> lis
 
 
 def _paired_test(differences: Float64Array) -> tuple[tuple[float, float] | None, float | None]:
-    """Return the 95 % interval and the p-value of a t-test of differences (T,) against zero."""
+    """Return the 95 % confidence interval and the p-value of a t-test of differences (T,) against
+    zero.
+    """
     if len(differences) > 1 and np.abs(differences).max() < _SAME_DEG:
         return (0.0, 0.0), 1.0
     if len(differences) < 2 or np.ptp(differences) < _SAME_DEG:
@@ -130,8 +132,8 @@ def _paired_test(differences: Float64Array) -> tuple[tuple[float, float] | None,
 def holm(p_values: Sequence[float]) -> list[float]:
     """Return p-values after Holm's step-down correction.
 
-    The k-th smallest of m p-values is multiplied by m + 1 - k. Corrected values do not decrease and
-    are at most 1.
+    The k-th smallest of m p-values is multiplied by m + 1 - k. Corrected values are non-decreasing
+    and at most 1.
     """
     order = np.argsort(p_values, kind="stable")
     stepped = np.array(p_values)[order] * np.arange(len(p_values), 0, -1)
@@ -140,18 +142,18 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return [float(p) for p in corrected]
 
 
-# captures; with more, the table uses small type, so that DiLiGenT's ten fit on a page
+# With more captures, the table uses small type, so that DiLiGenT's ten captures fit on a page.
 _MOST_WIDE = 6
 _LATEX = str.maketrans(
     {character: f"\\{character}" for character in "&%$#_{}"}
     | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-    # In TeX's oldest font encoding, which is still the default, these codes are other characters.
+    # In TeX's default font encoding, the oldest one, these codes are other characters.
     | {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}
 )
 
 
 def table_rows(evaluation: Evaluation) -> list[list[str]]:
-    """Return a header row, then a row for each method: name, MAE on each capture, and average.
+    """Return a header row, then one row for each method: name, MAE on each capture, and average.
 
     The errors have two decimals.
     """
@@ -179,15 +181,14 @@ def best_cells(rows: Sequence[Sequence[str]]) -> set[tuple[int, int]]:
 
 
 def caption(evaluation: Evaluation) -> str:
-    """Return a table's caption: "Mean angular error in degrees: 10 lights, ..."."""
+    """Return a table's caption, such as "Mean angular error in degrees: 10 lights, ..."."""
     return f"Mean angular error in degrees: {protocol_in_words(evaluation.protocol)}."
 
 
 def markdown(evaluations: Sequence[Evaluation]) -> str:
-    """Return a Markdown table of methods by captures and their average, with a caption below it.
+    """Return a Markdown table of methods by captures and their average, followed by a caption.
 
-    The best value in each column is bold. With several evaluations, each has its own table under a
-    heading.
+    The best value in each column is bold. Several evaluations have separate tables with headings.
     """
     tables = []
     for evaluation in evaluations:

@@ -1,5 +1,5 @@
-"""Trials, the store of their scores, which are saved as they are computed, and the capture data for
-each trial.
+"""Trials, a store that saves their scores as they are computed, and the data of a capture for its
+trials.
 """
 
 import hashlib
@@ -44,7 +44,7 @@ class Trial:
 
     capture: str  # name of the capture in the tables
     method: str
-    number: int  # of the trial, from 0
+    number: int  # number of the trial, from 0
     lights: Draw
     protocol: Protocol
     made_of: str  # digest of the capture's files and of the method's settings
@@ -69,15 +69,16 @@ class Trial:
 
     @property
     def key(self) -> str:
-        """SHA-256 of all that affects the score. The noise depends on seed and number, the pixels
-        on the seed.
+        """SHA-256 of everything that affects the score.
+
+        The noise depends on seed and number, and the pixels on the seed.
         """
         values = self.record
-        del values["capture"]  # only a name in the tables; made_of covers the files themselves
+        del values["capture"]  # only a name; made_of depends on the files
         if self.protocol.light_error_deg is None:
             del values["light_error_deg"]  # so that earlier trials stay valid
         if not self.protocol.finds_lights:
-            del values["finds_lights"]  # likewise
+            del values["finds_lights"]  # for the same reason
         if self.protocol.light_noise_deg == 0:
             del values["number"]
             if self.protocol.max_pixels is None:
@@ -96,18 +97,17 @@ class Score(Struct, frozen=True):
 
 
 class _Line(Score, frozen=True, kw_only=True):
-    """The part of a stored line that is read again; the rest describes the trial for people."""
+    """The part of a stored line that is read again. The rest describes the trial for people."""
 
     key: str
 
 
 class TrialStore:
-    """Scores by trial, in memory and, if a path is given, in a JSON Lines file, which is created
-    for the first score.
+    """Scores by trial, in memory and, with a path, in a JSON Lines file.
 
-    Lines that cannot be read, for example because they were truncated, are dropped. A link is
-    replaced, not followed. `fresh` deletes the scores of an earlier evaluation. Raises OutputError
-    if the file cannot be read or written.
+    The file is created for the first score. Lines that cannot be read, for example because they
+    were truncated, are dropped. A link is replaced, not followed. `fresh` deletes the scores of an
+    earlier evaluation. Raises OutputError if the file cannot be read or written.
     """
 
     def __init__(self, path: Path | None = None, *, fresh: bool = False) -> None:
@@ -130,11 +130,11 @@ class TrialStore:
                 write_text(path, "".join(kept))
 
     def find(self, trial: Trial) -> Score | None:
-        """Return the score of a trial, or None if it is not stored."""
+        """Return the score of a trial; None if it is not stored."""
         return self._scores.get(trial.key)
 
     def add(self, trial: Trial, score: Score) -> None:
-        """Store a score. Any thread may call this. Raises OutputError."""
+        """Store a score. This may be called from any thread. Raises OutputError."""
         with self._lock:
             self._scores[trial.key] = score
             if self._path is None:
@@ -147,28 +147,28 @@ class TrialStore:
                 file.write(line + "\n")
 
 
-# called with the number of images read so far and their total
+# Called with the number of images read so far and the total number
 OnImage = Callable[[int, int], object]
 Notes = list[tuple[str, ...]]  # sentences about a capture, for each protocol
-# the first 20 of DiLiGenT's Bear are corrupted, as users of the benchmark reported
+# The first 20 images of DiLiGenT's Bear are corrupted, as users of the benchmark reported.
 DAMAGED_IMAGES = {"bearPNG": 20}
 
 
 @dataclass(frozen=True)
 class TrialSource:
-    """A capture that was read once, from which each trial takes its lights.
+    """A capture that was read once, from which each trial selects its lights.
 
-    Every draw is restored separately: a saturated observation is restored from the other lights of
-    the draw, as `infer` does when it reads only these lights. `rows` are the rows of the
-    observations to score; None for all rows.
+    Every draw is restored separately: saturated observations are restored from the other lights of
+    the draw, as if `infer` read only these lights. `rows` are the rows of the observations to
+    score; None for all rows.
     """
 
     stored: Work
     rows: NDArray[np.integer] | None = None
 
     def see(self, trial: Trial, *, whole: bool = False) -> Capture:
-        """Return the capture under the lights of a trial, with noise added, refined or estimated as
-        the trial requires.
+        """Return the capture under the lights of a trial, with noise, refined or estimated if
+        required.
 
         It contains the scored pixels or, with `whole`, all pixels. As in `infer`, lights are
         refined or estimated from all pixels.
@@ -178,8 +178,7 @@ class TrialSource:
         if protocol.light_noise_deg:
             work = replace(work, capture=_with_noise(work.made, trial))
         work = replace(work, options=protocol.recipe)
-        # The intensities are estimated from all pixels, so this happens before the scored pixels
-        # are chosen.
+        # The intensities are estimated from all pixels, before the scored pixels are chosen.
         work = follow(work, "lights", "intensities")
         needs_all = work.options.finds_lights or work.options.refine_lights
         if pixels is not None and not needs_all and work.made.lamps is None:
@@ -187,7 +186,7 @@ class TrialSource:
         capture = follow(work, "saturation", "refinement").made
         if pixels is None:
             return capture
-        # Near lamps require the surface, which can only be computed from all pixels together.
+        # Near lamps require the surface, which is computed from all pixels together.
         return find_surface(capture).choose_pixels(pixels)
 
     def places(self, lights: Sequence[int]) -> list[int]:
@@ -197,9 +196,7 @@ class TrialSource:
 
 
 class SharedDraw:
-    """The capture shared by the methods of one draw. It is computed by the first method that needs
-    it.
-    """
+    """The capture shared by the methods of one draw, computed when a method first needs it."""
 
     def __init__(self, source: TrialSource) -> None:
         self._source = source
@@ -212,11 +209,11 @@ class SharedDraw:
         estimator: Estimator,
         begin: Callable[[int], Progress] = lambda n_pixels: ignore,
     ) -> Score:
-        """Return the score of a trial of the draw. Any thread may call this.
+        """Return the score of a trial of the draw. This may be called from any thread.
 
-        `begin` is called with the number of pixels before they are estimated and returns a function
-        that counts finished pixels. Raises SplinecliError if the method returns normals that are
-        not unit vectors.
+        `begin` is called with the number of pixels before they are estimated, and returns a
+        function that counts finished pixels. Raises SplinecliError if the method returns normals
+        that are not unit vectors.
         """
         source, whole = self._source, estimator.needs_capture
         with self._lock:
@@ -239,9 +236,9 @@ class SharedDraw:
 
 
 def _with_noise(capture: Capture, trial: Trial) -> Capture:
-    """Return the capture with the trial's noise on its lights; near lamps keep their distances."""
+    """Return the capture with the trial's noise on its lights. Near lamps keep their distances."""
     generator = np.random.default_rng([NOISE_STREAM, trial.protocol.seed, trial.number])
-    # With few lights and large noise, the lights can become coplanar. Such noise is drawn again.
+    # Few lights with large noise may become coplanar, so the noise is drawn again.
     for _ in range(100):
         directions = tilt_lights(
             capture.light_directions, trial.protocol.light_noise_deg, generator
@@ -255,17 +252,16 @@ def _with_noise(capture: Capture, trial: Trial) -> Capture:
 def tilt_lights(
     light_directions: NDArray[np.float64], sigma_deg: float, generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Return unit light directions (F, 3), each rotated by an angle from N(0, sigma_deg) in a
-    random direction.
+    """Return unit light directions (F, 3), each rotated by an angle from N(0, sigma_deg).
 
-    The root mean square of the angles is sigma_deg. A light that would fall below the horizon (z <=
-    0) is rotated the opposite way and stays above it, so that all directions are valid for a
-    capture.
+    The rotations are in random directions, and the root mean square of the angles is sigma_deg. A
+    light that would fall below the horizon (z <= 0) is rotated the opposite way and stays above it,
+    so that all directions are valid for a capture.
     """
     n_lights = len(light_directions)
     angle = np.radians(generator.normal(0.0, sigma_deg, n_lights).clip(-89.0, 89.0))
-    # A Gaussian vector without its part along the light: every perpendicular direction is equally
-    # likely.
+    # Removing the component along the light from a Gaussian vector makes every perpendicular
+    # direction equally likely.
     across = generator.normal(size=(n_lights, 3))
     along = np.einsum("fi,fi->f", across, light_directions)
     across = unit(across - along[:, None] * light_directions)
@@ -278,9 +274,9 @@ def tilt_lights(
 class CaptureReading:
     """The parts of a capture that its trials need."""
 
-    folder: Path  # the capture's folder as given; other processes open it again
+    folder: Path  # the capture's folder as given, which other processes open again
     name: str
-    # the protocols that can score it; they all score the same pixels
+    # the protocols that can score it, which all score the same pixels
     protocols: tuple[Protocol, ...]
     lights: tuple[int, ...]  # the lights used by any trial, in ascending order
     # whether all pixels are needed: a method uses them, or lights are refined or estimated
@@ -289,8 +285,9 @@ class CaptureReading:
     def read(
         self, source: CaptureSource, on_image: OnImage = lambda *_: None
     ) -> tuple[TrialSource, Notes]:
-        """Return the capture under all lights, and the notes on it, by protocol. Raises InputError,
-        UsageError.
+        """Return the capture under all lights, and notes on it by protocol.
+
+        Raises InputError or UsageError.
         """
         numbers, n_images = count(1), len(self.lights)
         as_stored = all(protocol.as_stored for protocol in self.protocols)
@@ -307,8 +304,8 @@ class CaptureReading:
         if len(pixels) == capture.n_pixels:
             trials = TrialSource(stored)
         elif self.whole or capture.lamps is not None or not (as_stored or source.intensities_known):
-            # `infer` estimates unknown intensities from all pixels, and near lamps require the
-            # whole surface.
+            # Unknown intensities are estimated from all pixels, as in `infer`, and near lamps
+            # require the whole surface.
             trials = TrialSource(stored, pixels)
         else:
             trials = TrialSource(stored.choose_pixels(pixels))
@@ -317,7 +314,7 @@ class CaptureReading:
 
 
 def open_to_score(folder: Path, protocol: Protocol) -> CaptureSource:
-    """Open a capture under a protocol. Raises InputError, UsageError."""
+    """Open a capture under a protocol. Raises InputError or UsageError."""
     try:
         return open_capture(folder, CaptureOptions(white_level=protocol.white_level))
     except OSError as error:
@@ -325,15 +322,15 @@ def open_to_score(folder: Path, protocol: Protocol) -> CaptureSource:
 
 
 def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
-    """Return sentences about the peculiarities of a capture and how the evaluation treated them."""
+    """Return sentences about peculiarities of a capture and how they were treated."""
     notes = []
     skipped, damaged = protocol.skipped_lights(name), DAMAGED_IMAGES.get(name, 0)
     if skipped:
         notes.append(f"{name}: the first {skipped} images were left out.")
     elif damaged:
         notes.append(
-            f"{name}: the first {damaged} images are known to be damaged and are used;"
-            f" --skip-first {name}={damaged} leaves them out."
+            f"{name}: the first {damaged} images are used although they are known to be damaged."
+            f" To leave them out, add --skip-first {name}={damaged}."
         )
     notes += [
         f"{name}: {warning}"
@@ -361,8 +358,8 @@ def scored_rows(
     """Return the rows of the observations that have ground truth, in ascending order.
 
     With `max_pixels`, at most that many are chosen by the seed, the same for every method and
-    trial. A method that uses neighbours estimates all pixels, but only these are scored. Raises
-    InputError without ground truth.
+    trial. A method that uses neighbouring pixels estimates all pixels, but only these are scored.
+    Raises InputError without ground truth.
     """
     if capture.ground_truth is None:
         raise InputError(f"{capture.name}: the capture has no ground truth")

@@ -1,4 +1,4 @@
-"""The gloss of each pixel, from the material net: everything about its material but the base."""
+"""The gloss of each pixel from the material net: all parameters of the material except the base."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from splinecli.system.machine import one_thread_each, side_by_side
 # In larger captures, the net is applied to every second, third, ... row and column
 _MOST_PIXELS = 60_000
 _BATCH = 1024
-_UNKNOWN_ERROR = 10.0  # of the roughness of a black pixel
-_SMOOTH = 2.0  # pixels: standard deviation of the mean over neighbours
+_UNKNOWN_ERROR = 10.0  # error of the roughness of a black pixel
+_SMOOTH = 2.0  # standard deviation of the smoothing in pixels
 
 
 def estimate_gloss(mask: Bools, lighting_at: LightingAt) -> Gloss:
-    """Estimate the gloss of the P pixels of a mask (H, W), with `log_level` in the unit of the
+    """Return the gloss of the P pixels of a mask (H, W), with `log_level` in the unit of the
     observations.
 
     Raises ModelError if the weights are damaged.
@@ -62,7 +62,7 @@ def estimate_gloss(mask: Bools, lighting_at: LightingAt) -> Gloss:
 
     weights = found[Gloss._fields.index("roughness_error")] ** np.float32(-2)
     total = blurred_from_chosen(weights)
-    reached = total > 1e-6 * weights.max()  # others are far from all chosen pixels
+    reached = total > 1e-6 * weights.max()  # false far from all chosen pixels
     smooth = []
     for values in found:
         usual = np.float32(np.average(values, weights=weights))
@@ -74,9 +74,7 @@ def estimate_gloss(mask: Bools, lighting_at: LightingAt) -> Gloss:
 
 
 def blurred(values: Float32Array, mask: Bools, deviation: float) -> Float32Array:
-    """Return a Gaussian blur of values (P,) on the pixels of a mask (H, W), outside of which they
-    are zero.
-    """
+    """Return a Gaussian blur of values (P,) at the pixels of a mask (H, W), with zeros outside."""
     from cv2 import GaussianBlur
 
     return np.asarray(GaussianBlur(on_map(values, mask), (0, 0), deviation)[mask], np.float32)

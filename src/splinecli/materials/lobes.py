@@ -5,9 +5,10 @@ The radiance of a pixel is
     base * ((1 - metallic) * diffuse + metallic * facets) + level * (1 - metallic) * facets
 
 in the unit of the observations, where `diffuse` and `facets` are lobes of the principled BRDF
-(Burley, "Physically Based Shading at Disney", SIGGRAPH 2012). With the roughness fixed, radiance is
-linear in the other parameters, except for Fresnel's increase at grazing angles. The camera looks
-along the z axis and lights are above the horizon, so this is at most 0.2 % of full reflection.
+(Burley, "Physically Based Shading at Disney", SIGGRAPH 2012). If the roughness is fixed, radiance
+is linear in the other parameters, except for the Fresnel effect at grazing angles. Since the camera
+looks along the z axis and lights are above the horizon, this effect is at most 0.2 % of full
+reflection.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-LEAST_Z = 0.05  # of a normal; the BRDF has no value for a surface that faces away from the camera
+LEAST_Z = 0.05  # smallest z of a normal, because the BRDF needs a surface that faces the camera
 # Reflectance at normal incidence of a dielectric whose `specular` is 1 (Burley 2012)
 F0_OF_SPECULAR = 0.08
-GGX = 2.0  # the exponent of the facets' distribution; smaller ones have longer tails
+GGX = 2.0  # exponent of the facets' distribution; smaller exponents have longer tails
 
 _DIFFUSE_ROUGHNESS = 0.25
-"""Of the diffuse lobe. In the BRDF, it follows the roughness of the facets. Real surfaces and the
-renderer's deviate from that by more, so that it would only mislead the fit."""
+"""Roughness of the diffuse lobe. In the BRDF, it is equal to the roughness of the facets, but this
+is less accurate than a constant, both for real and for rendered surfaces."""
 
 
 class Geometry(NamedTuple):
@@ -37,10 +38,10 @@ class Geometry(NamedTuple):
 
     @classmethod
     def of(cls, normals: Tensor, lights: Tensor, normal_error: Tensor) -> Geometry:
-        """Return the geometry of unit normals (P, 3), unit lights, (F, 3) or (P, F, 3), and errors
-        (P,) in radians.
+        """Return the geometry of unit normals (P, 3), unit lights (F, 3) or (P, F, 3), and errors
+        (P,).
 
-        z points to the camera.
+        The errors are in radians, and z points to the camera.
         """
         if lights.ndim == 2:
             n_dot_l = normals @ lights.T
@@ -51,8 +52,9 @@ class Geometry(NamedTuple):
 
 
 def diffuse_lobe(geometry: Geometry, minnaert: Tensor) -> Tensor:
-    """Return the radiance (P, F) of a white matte surface, zero in attached shadow. `minnaert` is
-    (P, 1) or (1, 1).
+    """Return the radiance (P, F) of a white matte surface, zero in attached shadow.
+
+    `minnaert` is (P, 1) or (1, 1).
     """
     n_dot_l, n_dot_v, l_dot_v, _ = geometry
     lit, one = n_dot_l.clamp(min=0), torch.ones_like(n_dot_v)
@@ -66,12 +68,11 @@ def diffuse_lobe(geometry: Geometry, minnaert: Tensor) -> Tensor:
 
 
 def facet_lobe(geometry: Geometry, roughness: Tensor, tail: Tensor) -> Tensor:
-    """Return the radiance (P, F) of a perfect metal, zero in attached shadow. The others are (P, 1)
-    or (1, 1).
+    """Return the radiance (P, F) of a perfect metal, zero in attached shadow.
 
-    The lobe is the mean over the errors of the normals, which is wider: a highlight in a wrong
-    place is worse than a blurred one. The variance of the facets' slopes is roughness^4 / 2 (of
-    Beckmann's distribution; GGX has none).
+    Roughness and tail are (P, 1) or (1, 1). The lobe is averaged over the errors of the normals and
+    therefore wider, because a blurred highlight is better than one in the wrong place. The variance
+    of the facets' slopes is roughness^4 / 2 (for Beckmann's distribution; it is infinite for GGX).
     """
     n_dot_l, n_dot_v, l_dot_v, normal_error = geometry
     lit = n_dot_l.clamp(min=0)
@@ -81,8 +82,8 @@ def facet_lobe(geometry: Geometry, roughness: Tensor, tail: Tensor) -> Tensor:
 
 
 def half_vector_cosines(n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> tuple[Tensor, Tensor]:
-    """Return l.h and the square of n.h, with h the half vector of light and view."""
-    # Light from behind the surface has no half vector, and rounding would give NaN.
+    """Return l.h and the square of n.h, where h is the half vector of light and view."""
+    # Light from behind has no half vector, so rounding would give NaN.
     l_dot_h = ((1 + l_dot_v) / 2).clamp(min=1e-6).sqrt()
     n_dot_h = ((n_dot_l + n_dot_v) / (2 * l_dot_h)).clamp(0, 1)
     return l_dot_h, n_dot_h * n_dot_h
@@ -91,18 +92,18 @@ def half_vector_cosines(n_dot_l: Tensor, n_dot_v: Tensor, l_dot_v: Tensor) -> tu
 def facets(
     n_dot_h_squared: Tensor, lit: Tensor, n_dot_v: Tensor, roughness: Tensor, tail_exponent: Tensor
 ) -> Tensor:
-    """Return the microfacet distribution times its shadowing; this is GGX if the tail exponent is
+    """Return the microfacet distribution times its shadowing, which is GGX for a tail exponent of
     2.
 
     As in Disney's own later code, Smith's shadowing uses the roughness directly, without the
-    remapping of 2012. The lobe is never narrower than at roughness 0.1, which float32 still
+    remapping of 2012. The lobe is never narrower than at a roughness of 0.1, which float32 still
     resolves.
     """
     alpha_squared = (roughness**4).clamp(min=1e-4)
     spread = n_dot_h_squared * (alpha_squared - 1) + 1
     if bool((tail_exponent < 2).any()):
-        # Pi times the factor that normalises the facets 1 / (1 + (a^2 - 1) (n.h)^2)^gamma, which is
-        # a^2 for gamma = 2
+        # Pi times the normalisation of the facets 1 / (1 + (a^2 - 1) (n.h)^2)^gamma, which is a^2
+        # for gamma = 2
         narrow = alpha_squared.clamp(max=0.999)
         norm = (tail_exponent - 1) * (1 - narrow) / (narrow ** (1 - tail_exponent) - 1)
         lobe = norm * power(spread, -tail_exponent)
@@ -112,8 +113,8 @@ def facets(
 
 
 def schlick_weight(cosine: Tensor) -> Tensor:
-    """Return (1 - cosine)^5, the weight of grazing reflection in Schlick's Fresnel
-    approximation.
+    """Return (1 - cosine)^5, the weight of grazing reflection in Schlick's approximation of
+    Fresnel.
     """
     complement = (1 - cosine).clamp(0, 1)
     square = complement * complement
@@ -126,7 +127,7 @@ def power(base: Tensor, exponent: Tensor) -> Tensor:
 
 
 def smith_ggx(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
-    """Return Smith's shadowing of the GGX distribution over 2 n.x: 1 / (n.x + sqrt(a^2 + (1 -
+    """Return Smith's shadowing of GGX divided by 2 n.x: 1 / (n.x + sqrt(a^2 + (1 -
     a^2)(n.x)^2)).
     """
     return 1 / (cosine + (alpha_squared + (1 - alpha_squared) * cosine * cosine).sqrt())
@@ -134,10 +135,10 @@ def smith_ggx(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
 
 _RELATIVE, _DEGREES_OF_FREEDOM = 0.05, 3.0
 _MOST_LOBE_ERROR = 0.6
-"""The errors of observations: a share of the prediction, with the tails of Student's distribution.
-A sharp lobe also changes with the normals' errors, at most by the last share of itself."""
+"""Errors of observations are relative to the prediction and have Student's distribution. Errors of
+the normals also change a sharp lobe, by at most the last share."""
 
-_STEPS = 4  # of the robust fit of a base
+_STEPS = 4  # steps of the robust fit of a base
 
 
 class LitPixels(NamedTuple):
@@ -146,12 +147,12 @@ class LitPixels(NamedTuple):
     observations: Tensor  # (P, F)
     geometry: Geometry
     lit: Tensor  # (P, F), 1 where the light reaches the pixel, else 0
-    floor: Tensor  # (P, 1), the error that even a dark observation has
-    white: float  # pictures end at this value
+    floor: Tensor  # (P, 1), the minimum error of an observation
+    white: float  # the largest value in pictures
 
 
 class Base(NamedTuple):
-    """A base that is expected, with its standard error, each (P, 1)."""
+    """An expected base with its standard error, each (P, 1)."""
 
     value: Tensor
     error: Tensor
@@ -165,12 +166,12 @@ def fit_base(
     lobe_error: Tensor,
     expected: Base | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Return the bases (P, 1) that fit best, base * slope + offset, and the weights (P, F) of the
-    observations.
+    """Return the bases (P, 1) of the best fit, base * slope + offset, and the observations' weights
+    (P, F).
 
     Args:
         slope, offset: (P, F).
-        of_facets: (P, F), the part of the slope that the facets have.
+        of_facets: (P, F), the facets' part of the slope.
         lobe_error: (P, 1), from lobe_error.
         expected: determines the base where the observations do not. None for no expectation.
     """
@@ -194,16 +195,17 @@ def fit_base(
 
 
 def lobe_error(geometry: Geometry, roughness: Tensor) -> Tensor:
-    """Return the share (P, 1) by which errors of the normals change the radiance of facets of a
-    roughness (P, 1).
+    """Return the share (P, 1) by which errors of the normals change the radiance of facets.
+
+    The roughness is (P, 1).
     """
     wide = (roughness**4 + 2 * geometry.normal_error**2).sqrt()
     return (geometry.normal_error / (2 * wide.clamp(min=0.01))).clamp(max=_MOST_LOBE_ERROR)
 
 
 def predict_left_out(sample: LitPixels, slope: Tensor, offset: Tensor, weights: Tensor) -> Tensor:
-    """Return the predictions (P, F) of base * slope + offset, each fitted to the other observations
-    of its pixel.
+    """Return predictions (P, F) of base * slope + offset, each fitted to the pixel's other
+    observations.
     """
     above, below = weights * slope * (sample.observations - offset), weights * slope**2
     others = below.sum(1, keepdim=True) - below

@@ -1,4 +1,4 @@
-"""Maps of a capture's material, from its images, lights and normals, and pictures of it under other
+"""Maps of a capture's material, from its images, lights and normals, and pictures under other
 lights.
 """
 
@@ -33,42 +33,45 @@ from splinecli.maths.pixel_grid import on_map
 from splinecli.records.output_files import MAPS
 from splinecli.surface.integration import integrate_normals
 
-_LIT = 0.05  # n.l from which a light is used; the rounded rim of a shadow is below
+_LIT = 0.05  # smallest n.l of a light that is used, which excludes the rounded rim of a shadow
 _BRIGHT_QUANTILE = 0.95
-_SMOOTH = 4.0  # pixels: standard deviation of the mean over which the trust is decided
+_SMOOTH = 4.0  # standard deviation in pixels of the smoothing of the trust
 # Mean reflectance of dielectrics at normal incidence, which determines the exposure
 _DIELECTRIC = 0.04
-_WHITE_QUANTILE = 0.99  # of the bases, which are at most 1
-_MOST_EXPOSURE = 10.0  # times the exposure that makes the brightest bases white
-_SURE = 0.1  # the error of a roughness that the confidence refers to
+_WHITE_QUANTILE = 0.99  # quantile of the bases that is at most white
+_MOST_EXPOSURE = 10.0  # relative to the exposure at which the brightest bases are white
+_SURE = 0.1  # error of the roughness that the confidence refers to
 _LAPLACE = 1.41  # standard deviation of a Laplace distribution, in mean absolute errors
-# Errors of all observations, as shares of the bright pixels' albedo and of the mean observation
+# Minimum errors of observations, relative to the bright pixels' albedo and the mean observation
 _FLOOR, _FLAT = 0.005, 0.12
 _WHITE = 0.999  # quantile of the observations
-_GRAY = 1e-3  # of the tint, below which all channels are equal
+_GRAY = 1e-3  # largest tint for which all channels are considered equal
 _NORMAL_ERROR = 0.04  # radians, without a confidence
 _LEAST_ERROR, _MOST_ERROR = 0.015, 0.25  # radians
-_CONFIDENT = np.radians(5)  # the error that the confidence of a normal refers to
+_CONFIDENT = np.radians(5)  # error that the confidence of a normal refers to
 # Shadows of larger maps are computed for every second, third, ... row and column
 _MOST_CELLS = 40_000
 
 
 @dataclass(frozen=True, eq=False)
 class MaterialMaps:
-    """The material of the P pixels of a mask, in glTF's parameters, and further values for
+    """The material of the P pixels of a mask, with glTF's parameters and further values for
     pictures.
 
-    base_colour: (P, 3) linear RGB; all channels are equal for gray images. The exposure of
-        photographs is unknown, so the scale is chosen such that dielectrics reflect 4 % on average,
-        but never so that the brightest bases exceed white.
-    roughness, metalness, specular: (P,), Burley's parameters. `specular` may exceed 1.
-    confidence: (P,), the probability that the roughness is wrong by at most 0.1.
-    minnaert, tail: (P,), exponents of the diffuse light and of the facets' distribution, which glTF
-    does not have. matte: (P,), the reflectance of a matte surface that fits best, in the unit of
-    the observations. trust: (P,), the share of the material in pictures; the rest is matte. It is
-        chosen by how well each predicts observations that are left out.
-    white: the brightest observation of pictures.
-    exposure: the observation of a matte white surface that faces the light.
+    Args:
+        base_colour: (P, 3) linear RGB; all channels are equal for gray images. Since the exposure
+            of photographs is unknown, the scale is chosen such that dielectrics reflect 4 % on
+            average, but the brightest bases do not exceed white.
+        roughness, metalness, specular: (P,), Burley's parameters. `specular` may exceed 1.
+        confidence: (P,), the probability that the error of the roughness is at most 0.1.
+        minnaert, tail: (P,), exponents of the diffuse light and of the facets' distribution, which
+            glTF does not have.
+        matte: (P,), the reflectance of the best-fitting matte surface, in the unit of the
+            observations.
+        trust: (P,), the share of the material in pictures, mixed with the matte surface. It depends
+            on how well each predicts observations that were left out.
+        white: the brightest observation of pictures.
+        exposure: the observation of a matte white surface that faces the light.
     """
 
     base_colour: Float32Array
@@ -94,16 +97,16 @@ def estimate_material(
     normal_confidence: Float32Array | None = None,
     colours: Iterable[Float32Array] | None = None,
 ) -> MaterialMaps:
-    """Estimate the material of each pixel of a mask (H, W).
+    """Return the material of each pixel of a mask (H, W).
 
     Args:
         normals: (P, 3) unit, in the capture's frame.
-        lights: (F, 3) unit, at the middle of the object; they determine the shadows.
-        lighting_at: returns observations and light directions of some pixels.
-        normal_confidence: (P,), the probability that a normal is off by at most 5 degrees. None if
-            it is unknown.
-        colours: for each light, the linear RGB values (P, 3) whose channels have the observations
-            as their mean; None for gray images.
+        lights: (F, 3) unit, at the middle of the object, which determine the shadows.
+        lighting_at: returns observations and light directions of pixels.
+        normal_confidence: (P,), the probability that the error of a normal is at most 5 degrees.
+            None if it is unknown.
+        colours: for each light, the linear RGB values (P, 3), whose mean over the channels is the
+            observation; None for gray images.
 
     Raises:
         InputError: there are too few lights.
@@ -150,8 +153,7 @@ def render_gray(
     reached: Bools,
     normal_confidence: Float32Array | None = None,
 ) -> Float32Array:
-    """Return the observations (P, F) of a material under distant lights (F, 3), in the unit of its
-    own observations.
+    """Return the observations (P, F) of a material under distant lights (F, 3), in its own unit.
 
     Args:
         normals, normal_confidence: as for estimate_material.
@@ -181,10 +183,11 @@ def render_gray(
 
 
 def lights_that_reach(normal_map: Floats, mask: Bools, lights: Floats) -> Bools:
-    """Return which distant lights (F, 3) reach the P pixels of the mask (H, W): (P, F), without
-    attached shadows.
+    """Return which distant lights (F, 3) reach the pixels of the mask (H, W), as a boolean array
+    (P, F).
 
-    The shadows are cast by the surface of the normals (H, W, 3), for an orthographic camera.
+    Only cast shadows are considered, not attached shadows. The surface is integrated from the
+    normals (H, W, 3) for an orthographic camera.
     """
     step = max(1, ceil(sqrt(np.count_nonzero(mask) / _MOST_CELLS)))
     coarse = mask[::step, ::step]
@@ -197,8 +200,9 @@ def lights_that_reach(normal_map: Floats, mask: Bools, lights: Floats) -> Bools:
 
 
 def _normal_error(normals: Float32Array, confidence: Float32Array | None) -> Float32Array:
-    """Return the expected errors (P,) of normals along each axis, in radians, as if they had a
-    normal distribution.
+    """Return the expected errors (P,) of normals along each axis, in radians.
+
+    The errors are assumed to have a normal distribution.
     """
     if confidence is None:
         return np.full(len(normals), _NORMAL_ERROR, np.float32)
@@ -208,7 +212,7 @@ def _normal_error(normals: Float32Array, confidence: Float32Array | None) -> Flo
 
 @dataclass(frozen=True)
 class _Pixels:
-    """Everything that is known about the pixels before the fit."""
+    """The data of the pixels before the fit."""
 
     normals: Float32Array  # (P, 3)
     normal_error: Float32Array  # (P,)
@@ -216,8 +220,9 @@ class _Pixels:
     lighting_at: LightingAt
 
     def take(self, chosen: PixelIndices, bright: float, white: float = np.inf) -> LitPixels:
-        """Return some of the pixels as the fits need them; `bright` is the albedo of bright
-        pixels.
+        """Return a selection of the pixels in the form needed for the fits.
+
+        `bright` is the albedo of bright pixels.
         """
         light: PixelLighting = self.lighting_at(chosen)
         observations, directions, normals, normal_error = float_tensors(
@@ -252,8 +257,8 @@ def _fit(
 ) -> tuple[Float32Array, Float32Array]:
     """Return five columns (p, 5), and the weights (p, F) of the observations in the base.
 
-    The columns are base, the contribution of white highlights to the weighted observations, which
-    is not part of the base, and the results of _compare.
+    The columns are the base, the contribution of white highlights to the weighted observations,
+    which is not part of the base, and the results of _compare.
     """
 
     def column(values: Tensor) -> Tensor:
@@ -279,12 +284,11 @@ def _fit(
 def _compare(
     sample: LitPixels, slope: Tensor, offset: Tensor, weights: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return a matte surface's reflectance (P,) and the two sums (P,) that determine how much of
-    the material to trust.
+    """Return the reflectance (P,) of a matte surface, and two sums (P,) that determine the trust.
 
     Each observation is predicted from the others, by the material and by the matte surface, with
-    the weights of the robust fits. The share of the material that minimises the squared error is
-    the ratio of the two sums.
+    the weights of the robust fits. The ratio of the two sums is the share of the material that
+    minimises the squared error.
     """
     cosine = sample.geometry.n_dot_l.clamp(min=0)
     base, matte_weights = fit_base(sample, cosine, 0 * cosine, 0 * cosine, torch.zeros(1, 1))
@@ -295,16 +299,16 @@ def _compare(
 
 
 def _smooth(values: Float32Array, mask: Bools) -> Float32Array:
-    """Return the values (P,) averaged over their neighbours in a mask (H, W)."""
+    """Return the values (P,) averaged over neighbours in a mask (H, W)."""
     return blurred(values, mask, _SMOOTH) / blurred(np.ones_like(values), mask, _SMOOTH)
 
 
 def _tint(
     colours: Iterable[Float32Array], weights: Float32Array, offset: Float32Array
 ) -> Float32Array:
-    """Return the colours (P, 3) of the bases relative to gray: their mean over the channels is 1.
+    """Return the colours (P, 3) of the bases relative to gray, with a mean of 1 over the channels.
 
-    The highlights of dielectrics are white: every channel has the offset (P,) of the gray image.
+    The highlights of dielectrics are white, so every channel has the offset (P,) of the gray image.
     """
     total = np.repeat(-offset[:, None], 3, axis=1)
     for place, colour in enumerate(colours):
@@ -315,11 +319,11 @@ def _tint(
 
 
 def _exposure(base: Float32Array, gloss: Gloss) -> float:
-    """Return the exposure at which dielectrics reflect as they usually do and no base exceeds
+    """Return the exposure at which dielectrics have their usual reflectance and no base exceeds
     white.
     """
     white = max(float(np.quantile(base.max(axis=1), _WHITE_QUANTILE)), 1e-9)
-    # In NumPy, because sums of PyTorch depend on the number of threads.
+    # NumPy is used because sums in PyTorch depend on the number of threads.
     dielectric, level = 1 - gloss.metalness.numpy(), gloss.log_level.exp().numpy()
     mean = float((dielectric * level).sum(dtype=np.float64)) / max(
         float(dielectric.sum(dtype=np.float64)), 1e-9

@@ -1,8 +1,9 @@
-"""The material net, which reads the gloss of each pixel off the tokens of the set branch.
+"""The material net, which predicts the gloss of each pixel from the tokens of the set branch.
 
-The tokens were trained to explain away highlights, so they already describe them. One more exchange
-with the other pixels of the capture is trained for the materials: an object has few glosses, and
-each is visible only in the pixels whose normals reflect a light to the camera.
+The tokens already describe highlights, because they were trained to estimate normals in spite of
+them. One further exchange of information with the other pixels of the capture is trained for
+materials, since an object has few kinds of gloss, and each is visible only in pixels whose normals
+reflect a light to the camera.
 """
 
 from __future__ import annotations
@@ -25,19 +26,19 @@ from splinecli.system.weight_files import load_shipped
 
 MATERIAL_FORMAT = "splinecli-material-net-1"
 
-TOKEN_WIDTH = 64  # of the set branch
+TOKEN_WIDTH = 64  # width of the tokens of the set branch
 _HIDDEN = 192
-_LEAST_ERROR = 0.02  # of a roughness
+_LEAST_ERROR = 0.02  # smallest error of a roughness
 
 
 class Gloss(NamedTuple):
-    """The materials of P pixels, each (P,). Reflectances are relative to the pixel's largest
+    """The gloss of P pixels, each (P,). Reflectances are relative to the pixel's largest
     observation.
     """
 
     roughness: Tensor
     roughness_error: Tensor  # expected absolute error
-    metalness: Tensor  # the probability that it is a metal, or its share in half metals
+    metalness: Tensor  # the probability of a metal, or the share of metal in a mixture
     log_base: Tensor  # natural logarithm of the base
     log_base_error: Tensor  # expected absolute error
     # natural logarithm of the reflectance of a dielectric's facets at normal incidence
@@ -47,9 +48,7 @@ class Gloss(NamedTuple):
 
 
 class MaterialNet(nn.Module):
-    """Predicts the gloss of pixels from their tokens, and from those of a sample of their
-    capture.
-    """
+    """Predicts the gloss of pixels from their tokens and a sample of their capture's tokens."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -65,10 +64,10 @@ class MaterialNet(nn.Module):
     def forward(
         self, pixels: PixelTokens, brightness: Tensor, known: Summary | None = None
     ) -> tuple[Gloss, Summary]:
-        """Return the gloss, and the summary of the captures, for further pixels of them.
+        """Return the gloss, and the summary of the captures, which can be used for further pixels.
 
-        Pixel p belongs to capture p % G, whose brightness (G,) is that of CaptureContext. `known`
-        is the summary of one capture; without one, the pixels of each capture attend to each other.
+        Pixel p belongs to capture p % G, whose brightness (G,) is from CaptureContext. `known` is
+        the summary of one capture. Without it, the pixels of each capture attend to each other.
         """
         level = brightness_level(pixels.scale, brightness)
         inputs = torch.cat((pixels.tokens, pixels.normal_z, level, pixels.n_lights.log()), dim=1)
@@ -89,7 +88,9 @@ class MaterialNet(nn.Module):
 
 
 def material_networks() -> tuple[SplineNet, MaterialNet]:
-    """Load spline-net, whose tokens describe materials, and the material net. Raises ModelError."""
+    """Return spline-net, whose tokens describe materials, and the material net. Raises
+    ModelError.
+    """
     shipped = manifest()["spline-net"]["material_net"]
     return resolve_weights("spline-net").network, load_shipped(
         MaterialNet(), shipped, MATERIAL_FORMAT

@@ -3,11 +3,11 @@ curvatures.
 
 Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 
-Slopes and curvatures need no integration, so drift and tears cannot occur. For a surface z(x, y)
-with unit normals n = (-p, -q, 1) / sqrt(1 + p^2 + q^2), let J be the matrix of the derivatives of
-(nx, ny) with respect to x and y. Its determinant is the Gaussian curvature, because normals rotate
-by as much as the surface does (Gauss), and half its trace is the mean curvature (do Carmo,
-Differential Geometry of Curves and Surfaces, 1976, 3-3).
+Slopes and curvatures are computed without integration, so there is no drift and there are no tears.
+For a surface z(x, y) with unit normals n = (-p, -q, 1) / sqrt(1 + p^2 + q^2), let J be the matrix
+of the derivatives of (nx, ny) with respect to x and y. Its determinant is the Gaussian curvature,
+because normals rotate as much as the surface does (Gauss), and half its trace is the mean curvature
+(do Carmo, Differential Geometry of Curves and Surfaces, 1976, 3-3).
 """
 
 from dataclasses import dataclass
@@ -20,14 +20,14 @@ from splinecli.maths import Bools, Float32Array, Float64Array, Floats
 
 Convention = Literal["opengl", "directx"]
 
-# The background of an encoded image may be gray, which stands for the zero vector. No real normal
-# is this short.
+# The background of a picture may be gray, which stands for the zero vector. Normals are longer than
+# this.
 SHORTEST_IN_PICTURE = 0.5
 _Float = TypeVar("_Float", bound=np.floating)
 
 
 def unit(vectors: NDArray[_Float]) -> NDArray[_Float]:
-    """Scale vectors (..., 3) to unit length. Zero vectors stay zero."""
+    """Return vectors (..., 3) scaled to unit length. Zero vectors remain zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     scaled: NDArray[_Float] = np.divide(
         vectors, length, out=np.zeros_like(vectors), where=length > 0
@@ -36,8 +36,8 @@ def unit(vectors: NDArray[_Float]) -> NDArray[_Float]:
 
 
 def spread_of(normals: Floats) -> float:
-    """Return the second largest standard deviation of unit normals (P, 3):
-    small for a flat object.
+    """Return the second largest standard deviation of unit normals (P, 3), small for a flat
+    object.
     """
     return float(np.sqrt(np.linalg.eigvalsh(np.cov(normals.T))[1]))
 
@@ -45,8 +45,8 @@ def spread_of(normals: Floats) -> float:
 def angle_between_deg(a: Floats, b: Floats) -> Float64Array:
     """Return the angles (...) in degrees between unit vectors a and b (..., 3), float64.
 
-    Uses atan2 of the cross and the dot product, which is accurate near 0 and 180 degrees, where
-    acos loses half its digits.
+    The computation uses atan2 of the cross and the dot product, which is accurate near 0 and 180
+    degrees, where acos loses half of its digits.
     """
     a64, b64 = np.asarray(a, np.float64), np.asarray(b, np.float64)
     sine = np.linalg.norm(np.cross(a64, b64), axis=-1)
@@ -62,7 +62,7 @@ def encode_picture(
     bits: int = 16,
     convention: Convention = "opengl",
 ) -> NDArray[np.unsignedinteger]:
-    """Encode a normal map (H, W, 3) as an RGB image of 8 or 16 bits, black outside the mask (H, W).
+    """Return a normal map (H, W, 3) as an RGB image of 8 or 16 bits, black outside the mask (H, W).
 
     A component n becomes (n + 1) / 2 of full scale. Green points up with "opengl" and down with
     "directx".
@@ -70,20 +70,20 @@ def encode_picture(
     signs = np.array([1.0, 1.0 if convention == "opengl" else -1.0, 1.0])
     top = 2**bits - 1
     picture = np.empty(normals.shape, np.uint8 if bits == 8 else np.uint16)
-    # Row by row, so that an image of many megapixels does not need several copies in float64.
+    # Row by row, to avoid several float64 copies of an image with many megapixels.
     for row, row_normals, row_mask in zip(picture, normals, mask, strict=True):
         row[:] = np.rint((row_normals * signs + 1) / 2 * top) * row_mask[:, None]
     return picture
 
 
 def describe(convention: Convention) -> str:
-    """Return the text to write into normal map files: the frame, and the direction of green."""
+    """Return the description for normal map files: the frame, and the direction of green."""
     green = "up" if convention == "opengl" else "down"
     return f"x right, y up, z to the camera; green is y {green}"
 
 
 def decode_picture(picture: NDArray[np.unsignedinteger]) -> Float64Array:
-    """Decode an RGB image (..., 3) of 8 or 16 bits, green up, to unit normals.
+    """Return unit normals for an RGB image (..., 3) of 8 or 16 bits, green up.
 
     Black and middle gray become zero vectors.
     """
@@ -96,13 +96,13 @@ def decode_picture(picture: NDArray[np.unsignedinteger]) -> Float64Array:
 
 @dataclass(frozen=True)
 class AngularErrors:
-    """Statistics of the angular error over the pixels that have a ground truth."""
+    """Statistics of the angular error over the pixels with ground truth."""
 
-    # mean (MAE), median, p90 (90th percentile): in degrees
+    # mean (MAE), median and 90th percentile in degrees
     mean: float
     median: float
     p90: float
-    # under_5, under_10: shares of the pixels, 0 to 1, with an error below 5 and below 10 degrees
+    # shares of the pixels, 0 to 1, with an error below 5 and below 10 degrees
     under_5: float
     under_10: float
 
@@ -111,19 +111,19 @@ def angular_error_map_deg(normals: Floats, ground_truth: Floats, mask: Bools) ->
     """Return the angular errors (H, W) of a normal map (H, W, 3) in degrees.
 
     They are NaN outside the mask (H, W) and where the ground truth (H, W, 3) is zero. The sign of a
-    normal matters: one that points the opposite way has an error of 180 degrees, not 0.
+    normal matters: a normal in the opposite direction has an error of 180 degrees, not 0.
     """
     scored = mask & ground_truth.any(axis=-1)
     errors = np.full(mask.shape, np.nan, np.float32)
-    # Row by row, because a map of many megapixels in float64 would need several gigabytes.
+    # Row by row, because a float64 map with many megapixels would need several gigabytes.
     for row, chosen in enumerate(scored):
         errors[row, chosen] = angle_between_deg(normals[row, chosen], ground_truth[row, chosen])
     return errors
 
 
 def summarise_errors(errors_deg: Floats) -> AngularErrors | None:
-    """Return the statistics of angular errors in degrees of any shape, without NaN; None if all are
-    NaN.
+    """Return the statistics of angular errors in degrees of any shape, ignoring NaN; None if all
+    are NaN.
     """
     errors = errors_deg[np.isfinite(errors_deg)].astype(np.float64)
     if not errors.size:
@@ -138,10 +138,10 @@ def summarise_errors(errors_deg: Floats) -> AngularErrors | None:
 
 
 def gradient_of_normals(normal_map: Float32Array, mask: Bools) -> Float32Array:
-    """Return the slopes p = dz/dx and q = dz/dy, (H, W, 2); NaN outside the mask and where the
-    surface is too steep.
+    """Return the slopes p = dz/dx and q = dz/dy, (H, W, 2).
 
-    The normals (H, W, 3) are unit in the mask (H, W); x right, y up, z to the camera.
+    They are NaN outside the mask (H, W) and where the surface is too steep. The normals (H, W, 3)
+    are unit in the mask; x right, y up, z to the camera.
     """
     # Normals beyond 87 degrees from the camera axis have no usable slope.
     z = np.where(mask & (normal_map[..., 2] >= 0.05), normal_map[..., 2], np.nan)
@@ -151,9 +151,9 @@ def gradient_of_normals(normal_map: Float32Array, mask: Bools) -> Float32Array:
 def curvature_of_normals(normal_map: Float32Array, mask: Bools, sigma: float = 2.0) -> Float32Array:
     """Return mean and Gaussian curvature (H, W, 2), in 1/pixel and 1/pixel^2; NaN outside the mask.
 
-    Both are positive on a bump: a sphere of radius R has 1/R and 1/R^2. A hollow has a negative
-    mean curvature. The normals are filtered with a standard deviation of `sigma` pixels; noise
-    falls with its square.
+    Both are positive on a bump: for a sphere of radius R, they are 1/R and 1/R^2. A hollow has a
+    negative mean curvature. The normals are filtered with a standard deviation of `sigma` pixels,
+    which reduces noise by its square.
     """
     (xx, xy), (yx, yy) = (
         _derivatives(normal_map[..., component], mask, sigma) for component in (0, 1)
@@ -167,14 +167,14 @@ def _derivatives(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the derivatives (H, W) of values with respect to x (right) and y (up).
 
-    They are the slopes of a plane that is fitted to the values of the mask with Gaussian weights.
-    Moments of a Gaussian are its derivatives. Inside, the slopes are the derivatives of the
-    filtered values; at the mask's edge, those would be too small.
+    They are the slopes of planes fitted to the values in the mask with Gaussian weights, computed
+    from moments, which are derivatives of Gaussians. Away from the mask's edge, they are equal to
+    the derivatives of the filtered values. At the edge, these would be too small.
     """
     from scipy.ndimage import gaussian_filter
 
     def moment(of: Float64Array, down: int, right: int) -> Float64Array:
-        """Return the sum of the weighted `of`, times offsets to these powers."""
+        """Return the weighted sum of `of` times offsets to these powers."""
         found = sigma ** (2 * (down + right)) * gaussian_filter(
             of, sigma, order=(down, right), mode="constant"
         )
@@ -186,7 +186,7 @@ def _derivatives(
     right, down, value = (
         moment(*m) / weight for m in ((inside, 0, 1), (inside, 1, 0), (inner, 0, 0))
     )
-    least = 1e-3 * sigma**2  # where the mask is a line
+    least = 1e-3 * sigma**2  # for masks that are lines
     rr = moment(inside, 0, 2) / weight - right**2 + least
     dd = moment(inside, 2, 0) / weight - down**2 + least
     rd = moment(inside, 1, 1) / weight - right * down

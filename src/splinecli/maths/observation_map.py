@@ -1,15 +1,15 @@
 """Observation maps: the observations of one pixel as an image, placed by the directions of their
 lights.
 
-A map is a square of `size` x `size` cells over the plane (x, y): the light directions' orthographic
-projection, from -1 to 1 in both axes. Column 0 is x = -1 and row 0 is y = +1, so y points up in a
-picture of the map. All cells have the same width, 2 / size, and the view axis passes through the
-common corner of the four middle cells. Rotations by 90 degrees and mirror images are therefore
+A map is a square of `size` x `size` cells over the plane (x, y), the orthographic projection of
+light directions, from -1 to 1 in both axes. Column 0 is x = -1 and row 0 is y = +1, so y points up
+in a picture of the map. All cells have the same width, 2 / size, and the view axis passes through
+the common corner of the four middle cells. Therefore, rotations by 90 degrees and mirror images are
 exact permutations of cells.
 
 CNN-PS (Ikehata, ECCV 2018) and SPLINE-Net (Zheng et al., ICCV 2019) use floor((size - 1)(x + 1) /
-2), whose last cell is a single point. It differs from ours by half a cell on average, nearly two
-degrees. Networks that were trained on such maps need the same grid: "cnn-ps".
+2), whose last cell is a single point. On average, this differs from ours by half a cell, nearly two
+degrees. Networks that were trained on such maps need the same grid, "cnn-ps".
 """
 
 from functools import lru_cache
@@ -21,14 +21,13 @@ from torch import Tensor
 MAP_SIZE = 32
 
 Grid = Literal["even", "cnn-ps"]
-"""The rule that assigns lights to cells: ours, or the one in CNN-PS and SPLINE-Net. Row 0 is y = +1
-in both.
-"""
+"""The rule that assigns lights to cells: ours, or that in CNN-PS and SPLINE-Net. Row 0 is y = +1 in
+both."""
 
 
 class SparseMap(NamedTuple):
-    """values: (P, C, size, size), zero in empty cells. occupied: (P, 1, size, size), one where an
-    observation is.
+    """Values (P, C, size, size), zero in empty cells, and occupied (P, 1, size, size), one in the
+    others.
     """
 
     values: Tensor
@@ -36,7 +35,7 @@ class SparseMap(NamedTuple):
 
 
 def light_cells(light_directions: Tensor, size: int = MAP_SIZE, grid: Grid = "even") -> Tensor:
-    """Return the flat cell index row * size + column (...), int64, of unit light directions (...,
+    """Return flat cell indices row * size + column (...), int64, of unit light directions (...,
     3).
     """
     if grid == "cnn-ps":
@@ -52,10 +51,10 @@ def light_cells(light_directions: Tensor, size: int = MAP_SIZE, grid: Grid = "ev
 
 @lru_cache(maxsize=8)
 def cell_directions(size: int = MAP_SIZE) -> tuple[Tensor, Tensor]:
-    """Return the light directions at the centres of the cells (size, size, 3), and the mask (size,
-    size) of the disc.
+    """Return the light directions at the centres of the cells (size, size, 3), and the mask of the
+    disc.
 
-    No light can be in a cell outside the disc. Its direction is a zero vector.
+    No light can be in a cell outside the disc (size, size). Its direction is a zero vector.
     """
     # The result is cached, so it must not depend on a default device.
     centre = (torch.arange(size, dtype=torch.float64, device="cpu") + 0.5) * (2 / size) - 1
@@ -69,8 +68,8 @@ def cell_directions(size: int = MAP_SIZE) -> tuple[Tensor, Tensor]:
 def unit_disc(size: int = MAP_SIZE, grid: Grid = "even") -> Tensor:
     """Return the mask (size, size) of the cells whose centres are in the unit disc.
 
-    The "cnn-ps" grid takes the cells whose index, scaled to [-1, 1], is in the disc. These are
-    slightly fewer: 740 instead of 812 at size 32.
+    For the "cnn-ps" grid, these are the cells whose index, scaled to [-1, 1], is in the disc. They
+    are slightly fewer: 740 instead of 812 for size 32.
     """
     if grid == "even":
         return cell_directions(size)[1]
@@ -86,8 +85,7 @@ def sparse_map(
     size: int = MAP_SIZE,
     grid: Grid = "even",
 ) -> SparseMap:
-    """Return the sparse maps of values (P, F) or (P, F, C). Values of lights in the same cell are
-    averaged.
+    """Return the sparse maps of values (P, F) or (P, F, C), averaged over lights in the same cell.
 
     The directions are (F, 3), or (P, F, 3) if each pixel has its own lights. Values that are not
     valid (P, F) are left out.
@@ -107,8 +105,8 @@ def sparse_map(
 
 
 def map_scale(observations: Tensor, valid: Tensor | None = None) -> Tensor:
-    """Return the largest valid observation of each pixel (P, 1), the divisor of its maps; 1 for an
-    all-zero pixel.
+    """Return the largest valid observation of each pixel (P, 1), which scales its maps; 1 for a
+    black pixel.
     """
     if valid is not None:
         observations = observations * valid
@@ -125,9 +123,7 @@ def rotate_about_view_axis(vectors: Tensor, cosine: Tensor, sine: Tensor) -> Ten
 
 
 def dot(vectors: Tensor, directions: Tensor) -> Tensor:
-    """Return the dot products (P, D) of a vector for each pixel (P, K) with directions (D, K) or
-    (P, D, K).
-    """
+    """Return the dot products (P, D) of vectors (P, K) with directions (D, K) or (P, D, K)."""
     if directions.ndim == 2:
         return vectors @ directions.T
     return (directions @ vectors[..., None])[..., 0]

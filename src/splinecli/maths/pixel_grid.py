@@ -1,5 +1,5 @@
-"""The pixels of a map: their rays through a pinhole camera, and square blocks of pixels, for
-coarser scales.
+"""The pixels of a map: their rays through a pinhole camera, and square blocks of pixels for coarser
+scales.
 
 A camera matrix is [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels. Columns count to the right, rows
 count down, and (0, 0) is the centre of the first pixel, as in OpenCV. Rays are in the frame of
@@ -22,12 +22,12 @@ from splinecli.maths import Array, Bools, Float32Array, Float64Array, Floats, In
 Places = NDArray[np.number[Any]]
 Value = TypeVar("Value", bound=np.generic)
 
-# Largest number in a camera matrix. Beyond it, equations of integration overflow or are singular.
+# Largest number in a camera matrix. With larger ones, integration overflows or is singular.
 _LARGEST = 1e6
 
 
 def on_map(values: NDArray[Value], mask: Bools) -> NDArray[Value]:
-    """Return the map (H, W, ...) of the values (P, ...) of a mask's pixels (H, W), zero outside."""
+    """Return a map (H, W, ...) of values (P, ...) at the pixels of a mask (H, W), zero outside."""
     placed = np.zeros((*mask.shape, *values.shape[1:]), values.dtype)
     placed[mask] = values
     return placed
@@ -40,23 +40,23 @@ def bounds(mask: Bools) -> tuple[Integers, Integers]:
 
 
 def slices(count: int, size: int) -> Iterator[slice]:
-    """Yield slices of at most `size` that together cover `count` items."""
+    """Return slices of at most `size` items that together cover `count` items."""
     return (slice(start, start + size) for start in range(0, count, size))
 
 
 def pixel_rays(mask: Bools, camera_matrix: Floats) -> Float64Array:
-    """Return the points (P, 3) at depth 1, z = -1, on the rays from a camera at the origin to
-    pixels of a mask (H, W).
+    """Return the points (P, 3) at depth 1, z = -1, on the camera rays of the pixels of a mask (H,
+    W).
 
-    Raises UsageError if the camera matrix is not 3 x 3, or InputError if it is not a valid camera
-    matrix.
+    The camera is at the origin. Raises UsageError if the camera matrix is not 3 x 3, or InputError
+    if it is not a valid camera matrix.
     """
     rows, columns = np.nonzero(mask)
     return rays_at(rows, columns, camera_matrix)
 
 
 def rays_at(rows: Places, columns: Places, camera_matrix: Floats) -> Float64Array:
-    """Return the points (N, 3) of pixel_rays at rows and columns (N,) of the image. Raises the same
+    """Return the points (N, 3) as in pixel_rays for image rows and columns (N,). Raises the same
     errors.
     """
     image = np.stack((columns, rows, np.ones(len(rows))), axis=1).astype(np.float64)
@@ -66,11 +66,11 @@ def rays_at(rows: Places, columns: Places, camera_matrix: Floats) -> Float64Arra
 def image_points(
     points: Floats, shape: tuple[int, ...], camera_matrix: Floats | None
 ) -> Float64Array:
-    """Return the columns and rows (P, 2) of the projections of points (P, 3); without a matrix they
-    are orthographic.
+    """Return the columns and rows (P, 2) of the projections of points (P, 3), relative to the
+    camera.
 
-    The points are relative to the camera, or without a matrix in pixels from the centre of the
-    image of `shape` (H, W).
+    Without a camera matrix, the projection is orthographic, and the points are in pixels from the
+    centre of the image of `shape` (H, W).
     """
     if camera_matrix is None:
         return np.asarray(
@@ -81,12 +81,13 @@ def image_points(
 
 
 def focal_length(camera_matrix: Floats) -> float:
-    """Return the focal length in pixels: the geometric mean of its values along both axes."""
+    """Return the focal length in pixels, the geometric mean of its values along both axes."""
     return float(np.sqrt(np.linalg.det(np.asarray(camera_matrix, np.float64)[:2, :2])))
 
 
 def ray_basis(camera_matrix: Floats) -> Float64Array:
-    """Return the rows (3, 3) that map an image point (column, row, 1) to its ray.
+    """Return the matrix (3, 3) by which an image point (column, row, 1) is multiplied to get its
+    ray.
 
     The first row is the step of a ray from one column to the next, the second the step from one row
     to the next, and the third the ray of the image's origin. Raises the errors of pixel_rays.
@@ -102,21 +103,23 @@ def ray_basis(camera_matrix: Floats) -> Float64Array:
         raise InputError(
             f"{matrix.tolist()} is not a camera matrix [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with"
             " positive fx and fy, and numbers of at most a million",
-            hint="Give it in pixels, with columns to the right and rows down",
+            hint="Use pixels, with columns to the right and rows down",
         )
     return np.asarray(np.linalg.inv(matrix).T * (1, -1, -1), np.float64)
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """The blocks of step x step pixels that contain a pixel of the object."""
+    """Blocks of step x step pixels that contain pixels of the object."""
 
-    mask: Bools  # (h, w) bool, true for these p blocks
-    step: int  # pixels along a side of a block
+    mask: Bools  # (h, w) bool, true for the p blocks
+    step: int  # side of a block in pixels
 
     @classmethod
     def over(cls, mask: Bools, number: int) -> Blocks:
-        """Return about `number` blocks over the pixels of a mask (H, W), at most twice as many."""
+        """Return about `number` blocks over the pixels of a mask (H, W), and at most twice as
+        many.
+        """
         step = max(1, math.ceil(math.sqrt(np.count_nonzero(mask) / number)))
         blocks = cls.of_step(mask, step)
         while (count := np.count_nonzero(blocks.mask)) > 2 * number:  # thin or scattered parts
@@ -166,13 +169,13 @@ class Blocks:
         )
 
     def numbers_at(self, rows: Integers, columns: Integers) -> Integers:
-        """Return the numbers (P,) of the blocks of some pixels."""
+        """Return the indices (P,) of the blocks that contain these pixels."""
         number = (np.cumsum(self.mask) - 1).reshape(self.mask.shape)
         return number[rows // self.step, columns // self.step]
 
     def spread(self, values: Array) -> Array:
-        """Return the map (h, w, ...) of the values (p, ...) of the blocks; other cells copy the
-        nearest block.
+        """Return a map (h, w, ...) of the blocks' values (p, ...). Other cells copy the nearest
+        block.
         """
         from scipy.ndimage import distance_transform_edt
 
@@ -181,9 +184,7 @@ class Blocks:
         return np.asarray(values[number[tuple(nearest)]])
 
     def sample(self, maps: Float32Array, rows: Integers, columns: Integers) -> Float32Array:
-        """Return the values (n, F) of a map (h, w, F) at some pixels, by bilinear interpolation
-        between the centres.
-        """
+        """Return the values (n, F) of a map (h, w, F) at these pixels, interpolated bilinearly."""
         height, width, count = maps.shape
         found = np.zeros((len(rows), count), np.float32)
         y, x = (
@@ -200,5 +201,5 @@ class Blocks:
 
     @property
     def _shift(self) -> float:
-        """The centre of the first block, in pixels."""
+        """The centre of the first block in pixels."""
         return (self.step - 1) / 2

@@ -1,8 +1,8 @@
 """Robust Lambertian fits in NumPy by weighted least squares, and the closed form of 3 x 3 systems
-that all fits use.
+for all fits.
 
-`inverse_3x3` takes NumPy arrays and torch tensors alike. It limits its pivots from below, so that
-the result stays positive definite.
+`inverse_3x3` works on both NumPy arrays and torch tensors. It limits its pivots from below, so that
+the result remains positive definite.
 """
 
 from collections.abc import Sequence
@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 from splinecli.maths import Float64Array, Floats
 
 MIN_LIGHTS = 3  # a normal scaled by an albedo has three unknowns
-# usual limit of pivots if the lights are unit vectors and the largest weight is about 1
+# Usual limit of pivots for unit light directions and a largest weight of about 1
 SMALLEST_PIVOT = 1e-12
 
 
 def inverse_3x3(entries: Sequence[Any], smallest: float) -> tuple[Any, ...]:
-    """Invert symmetric positive matrices, given and returned as their xx, yy, zz, xy, xz, yz, each
+    """Return the inverses of symmetric positive matrices in the form xx, yy, zz, xy, xz, yz, each
     (P,).
 
-    The factors of A = L D L' are inverted. Pivots are at least `smallest`, and at least 1e-14 of
-    the trace, the limit of rounding. The inverse is therefore positive definite even if the matrix
-    has rank 1 or 2.
+    The input has the same form. The factors of A = L D L' are inverted. Pivots are at least
+    `smallest`, and at least 1e-14 of the trace, the limit of rounding. Therefore, the inverse is
+    positive definite even if the matrix has rank 1 or 2.
     """
     xx, yy, zz, xy, xz, yz = entries
     floor = smallest + 1e-14 * (xx + yy + zz)
@@ -46,8 +46,8 @@ def inverse_3x3(entries: Sequence[Any], smallest: float) -> tuple[Any, ...]:
 
 
 def multiply_symmetric(entries: Sequence[Any], vector: Sequence[Any]) -> tuple[Any, Any, Any]:
-    """Multiply symmetric matrices, given as in `inverse_3x3`, by vectors given as their x, y, z,
-    each (P,).
+    """Return the products of symmetric matrices, as in `inverse_3x3`, and vectors x, y, z, each
+    (P,).
     """
     xx, yy, zz, xy, xz, yz = entries
     x, y, z = vector
@@ -55,8 +55,8 @@ def multiply_symmetric(entries: Sequence[Any], vector: Sequence[Any]) -> tuple[A
 
 
 def solve_each(values: NDArray[np.floating], vectors: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the least-squares solutions b (P, 3) of vectors (P, F, 3) @ b = values (P, F), pixel
-    by pixel.
+    """Return the least-squares solutions b (P, 3) of vectors (P, F, 3) @ b = values (P, F) for each
+    pixel.
     """
     x, y, z = np.moveaxis(np.asarray(vectors, np.float64), -1, 0)
     entries = [
@@ -70,14 +70,17 @@ SHADOW_SHARE = 0.05  # observations below this share of a pixel's largest one ar
 
 
 def shadow_weights(observations: Floats) -> Floats:
-    """Return weights (P, F): 1 for lit observations, nearly 0 for shadows, of pixels whose largest
-    observation is 1.
+    """Return weights (P, F), 1 for lit observations and nearly 0 for shadows.
+
+    The largest observation of each pixel is 1.
     """
     return np.where(observations < SHADOW_SHARE, 1e-3, 1.0).astype(observations.dtype)
 
 
 def shade(scaled_normals: Floats, light_directions: Floats) -> Floats:
-    """Return I = l . b (P, F) of scaled normals (P, 3) under lights (F, 3) or (P, F, 3)."""
+    """Return the observations I = l . b (P, F) of scaled normals (P, 3) under lights (F, 3) or (P,
+    F, 3).
+    """
     if light_directions.ndim == 2:
         return np.asarray(scaled_normals @ light_directions.T)
     return np.asarray((light_directions @ scaled_normals[..., None])[..., 0])
@@ -86,12 +89,11 @@ def shade(scaled_normals: Floats, light_directions: Floats) -> Floats:
 def fit_scaled_normals(
     observations: Floats, weights: Floats, light_directions: Floats, *, prior: float = 1e-6
 ) -> Floats:
-    """Return the scaled normals b (P, 3) of matte pixels that minimise the weighted squared
-    residuals of I = l . b.
+    """Return the scaled normals b (P, 3) of matte pixels that minimise weighted squared residuals.
 
-    Observations and weights are (P, F), light directions (F, 3) or (P, F, 3), of any length. The
-    prior pulls towards a black pixel, so that a pixel without three lit observations has a
-    solution.
+    The model is I = l . b. Observations and weights are (P, F), light directions (F, 3) or (P, F,
+    3), of any length. The prior pulls towards a black pixel, so that a pixel with fewer than three
+    lit observations has a solution.
     """
     x, y, z = np.moveaxis(light_directions, -1, 0)
     products = np.stack((x * x, y * y, z * z, x * y, x * z, y * z), axis=-1)
@@ -107,23 +109,20 @@ def _sum_over_lights(values: Floats, terms: Floats) -> Floats:
 
 
 def absolute_weights(residuals: Floats) -> Floats:
-    """Return weights with which the next weighted least squares approximates least absolute
-    deviations.
-    """
-    # nearly equal weights far below this residual
+    """Return weights for least absolute deviations by iteratively reweighted least squares."""
+    # Residuals far below this number have nearly equal weights.
     return np.asarray(1 / (np.abs(residuals) + 0.02))
 
 
 def fit_robustly(
     values: Floats, lit: Floats, lights: Floats, fits: int, weights: Floats | None = None
 ) -> tuple[Float64Array, Float64Array]:
-    """Return scaled normals (P, 3) of least absolute deviations, and the weights (P, F) of the next
+    """Return scaled normals (P, 3) of least absolute deviations, and weights (P, F) for the next
     fit.
 
-    Each pixel's values (P, F) are scaled to a largest value of 1. The weights `lit` (P, F) do not
-    depend on the fit, for example from shadow_weights; `weights` are for the first fit, by default
-    `lit`. The lights (F, 3) or (P, F, 3) have any length, and the number of weighted fits is at
-    least 1.
+    The largest value of each pixel's values (P, F) is 1. The weights `lit` (P, F), for example from
+    shadow_weights, do not depend on the fit; `weights` are for the first fit, by default `lit`. The
+    lights (F, 3) or (P, F, 3) have any length, and the number of weighted fits is at least 1.
     """
     weights = lit if weights is None else weights
     for _ in range(fits):
@@ -135,11 +134,11 @@ def fit_robustly(
 def lit_values(
     observations: Floats, dark_share: float, most: int
 ) -> tuple[NDArray[np.intp], Float64Array]:
-    """Return the rows (p,) of at most `most` lit pixels, evenly spread, and their values (p, F)
-    over each largest one.
+    """Return the rows (p,) of at most `most` lit pixels, evenly spread, and their relative values
+    (p, F).
 
-    Pixels below dark_share of the brightest hundredth are treated as dark, for example the
-    background without a mask.
+    The values are relative to the largest of each pixel. Pixels below dark_share of the brightest
+    hundredth are treated as dark, for example the background without a mask.
     """
     brightest = observations.max(axis=1)
     lit = np.flatnonzero(brightest > dark_share * np.quantile(brightest, 0.99))

@@ -13,15 +13,15 @@ from splinecli.maths import Float32Array, Float64Array, Floats
 
 _LINEAR_BELOW = 0.0031308  # linear value below which the sRGB curve is a straight line
 
-# The curve that the images state: a colour profile's curve, sRGB for JPEG, and for PNG that states
-# it; else linear.
+# Use the curve stated by the images: the colour profile's curve, sRGB for JPEG files and for PNG
+# files that state it, otherwise linear.
 AUTOMATIC = "auto"
-# An exponent (1 is linear), None for sRGB, or a table: the linear values of evenly spaced stored
-# values, 0 to 1.
+# An exponent (1 is linear), None for sRGB, or a table of the linear values of evenly spaced stored
+# values from 0 to 1
 TransferCurve = float | tuple[float, ...] | None
 SRGB: TransferCurve = None
 _CODES = np.linspace(0, 1, 256)
-# The curve of most videos (ITU-R BT.709), for values of 8 bits.
+# The curve of most videos (ITU-R BT.709), for 8-bit values
 BT709: TransferCurve = tuple(
     np.where(_CODES < 0.081, _CODES / 4.5, ((_CODES + 0.099) / 1.099) ** (1 / 0.45)).tolist()
 )
@@ -29,7 +29,7 @@ GAMMAS = 0.1, 10.0  # the smallest and the largest exponent
 
 
 def encode_srgb(linear: Floats) -> NDArray[np.uint8]:
-    """Encode linear values as 8-bit sRGB; values outside 0 to 1 are clipped."""
+    """Return linear values as 8-bit sRGB. Values outside 0 to 1 are clipped."""
     values = np.clip(linear, 0, 1)
     power = 1.055 * np.maximum(values, _LINEAR_BELOW) ** (1 / 2.4) - 0.055
     return np.asarray(
@@ -38,10 +38,10 @@ def encode_srgb(linear: Floats) -> NDArray[np.uint8]:
 
 
 def parse_transfer(text: str) -> float | None:
-    """Parse the name of a transfer curve: G for "gamma:G", 1 for "linear" and AUTOMATIC, None for
-    "srgb".
+    """Return the transfer curve with this name.
 
-    Raises UsageError if the name is unknown, or G is not between 0.1 and 10.
+    It is G for "gamma:G", 1 for "linear" and AUTOMATIC, and None for "srgb". Raises UsageError if
+    the name is unknown, or if G is not between 0.1 and 10.
     """
     named: dict[str, float | None] = {AUTOMATIC: 1.0, "linear": 1.0, "srgb": None}
     if text in named:
@@ -61,7 +61,7 @@ def parse_transfer(text: str) -> float | None:
 
 
 def decode_transfer(stored: Float32Array, curve: TransferCurve) -> Float32Array:
-    """Decode stored values, 0 to 1, to linear ones."""
+    """Return linear values for stored values from 0 to 1."""
     if curve == 1:
         return stored
     if isinstance(curve, tuple):

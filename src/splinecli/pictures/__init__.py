@@ -1,1 +1,1 @@
-"""Every picture and plot: maps, curves, lights, calibrations, contact sheets."""
+"""All pictures and plots: maps, curves, lights, calibrations and contact sheets."""

@@ -1,4 +1,4 @@
-"""The contact sheet of a capture: what was taken for what."""
+"""The contact sheet of a capture, which shows how its files are used."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from splinecli.maths import Bools, Floats, Picture
 from splinecli.pictures.maps import encode_png
 from splinecli.records.capture_warnings import ESTIMATED_LIGHTS, IMAGES_LEFT_OUT, LIGHTS_FOUND
 
-_SIDE, _GAP, _LINE = 112, 8, 15  # of a picture, between pictures, and of a line of text, in pixels
-_DISC = 15  # radius of the disc of a light
-_COLUMNS, _MOST_NOTES, _LETTER = 10, 12, 6  # the width of a letter in pixels
+_SIDE, _GAP, _LINE = 112, 8, 15  # pixels: side of a picture, gap, and height of a line of text
+_DISC = 15  # radius of the disc of a light in pixels
+_COLUMNS, _MOST_NOTES, _LETTER = 10, 12, 6  # _LETTER is the width of a letter in pixels
 _ORANGE, _PALE, _GRAY = (213, 94, 0), 235, 120
 
 
@@ -38,13 +38,12 @@ def sheet_of(source: CaptureSource, capture: Capture) -> bytes:
 def capture_sheet(
     capture: Capture, names: Sequence[str], others: Mapping[str, Floats], notes: Sequence[str]
 ) -> bytes:
-    """Return a PNG of the images of a capture in their order, as they are used: aligned, masked and
-    divided by the light intensities.
+    """Return a PNG of the images of a capture as they are used: aligned, masked and normalised.
 
-    A dot in the disc in the corner of an image shows the (x, y) of its light direction; the rim of
-    the disc is at a right angle to the viewing direction. The mask and `others`, such as an ambient
-    image, follow as linear gray maps (h, w). The notes, such as the images that were left out, are
-    below.
+    The images are in order and divided by the light intensities. In the disc in the corner of each
+    image, a dot shows (x, y) of its light direction; the rim of the disc is perpendicular to the
+    viewing direction. The mask and `others`, such as an ambient image, follow as linear gray maps
+    (h, w). Notes, for example about images that were left out, are at the bottom.
     """
     import cv2
 
@@ -88,8 +87,10 @@ def capture_sheet(
 
 
 def _sample(mask: Bools, step: int) -> tuple[NDArray[np.intp], Bools]:
-    """Return the numbers (n,) of every step-th pixel of a mask (H, W) in both directions, among its
-    true pixels, and this part of the mask.
+    """Return the indices (n,) of every step-th pixel in both directions among a mask's (H, W) true
+    pixels.
+
+    Also return the mask of these pixels.
     """
     before = np.concatenate(([0], np.cumsum(np.count_nonzero(mask, axis=1))))
     numbers = [
@@ -107,7 +108,7 @@ def _shown(values: Floats, white: float) -> Picture:
 
 
 def _draw_light(picture: Picture, x: float, y: float) -> Picture:
-    """Draw the disc of a light into the lower right corner of a picture, if there is room."""
+    """Draw the disc of a light into the lower right corner of a picture, if it is large enough."""
     side = 2 * _DISC + 1
     if min(picture.shape[:2]) < side:
         return picture

@@ -21,11 +21,11 @@ def encode_png(
     *,
     film: bool = False,
 ) -> bytes:
-    """Return the PNG file of an RGB picture (H, W, 3) or a gray picture (H, W) of 8 or 16 bits.
+    """Return the PNG file of an RGB picture (H, W, 3) or a gray picture (H, W) with 8 or 16 bits.
 
-    It has texts by keyword, in Latin-1 (PNG specification, tEXt). The values of a video have the
-    primaries and the transfer curve of BT.709 (cICP). Raises OutputError if OpenCV cannot encode
-    the picture.
+    `texts` are stored by keyword in Latin-1 (PNG specification, tEXt). With `film`, the file states
+    the primaries and the transfer curve of BT.709 (cICP). Raises OutputError if OpenCV cannot
+    encode the picture.
     """
     import cv2
 
@@ -39,11 +39,11 @@ def encode_png(
     added = b""
     for chunk in chunks:
         added += struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    return file[:33] + added + file[33:]  # behind the header, which is the first chunk of a file
+    return file[:33] + added + file[33:]  # after the header, which is the first chunk
 
 
-PREVIEW_LIGHT = (-0.72, 0.48, 0.5)  # direction: low, from the upper left, which shows relief best
-# of the colour scale; larger errors have the last colour: the scale serves the small errors
+PREVIEW_LIGHT = (-0.72, 0.48, 0.5)  # a low direction from the upper left, which emphasises relief
+# end of the colour scale, chosen to show small errors; larger errors have the last colour
 TOP_DEG = 30.0
 TICKS = {TOP_DEG * third / 3: f"{TOP_DEG * third / 3:g}" + "+" * (third == 3) for third in range(4)}
 TITLE = "angular error (deg)"
@@ -52,20 +52,22 @@ TITLE = "angular error (deg)"
 def albedo_picture(albedo: Float32Array, mask: Bools) -> Picture:
     """Return a linear albedo map (H, W, 3) as an sRGB picture.
 
-    The brightest 1 % of the pixels are white. The scale depends on the pixels of the mask (H, W)
-    alone, which is not empty.
+    The brightest 1 % of the pixels are white. The scale depends only on the pixels of the mask (H,
+    W), which is not empty.
     """
     white = max(float(np.quantile(albedo[mask].max(axis=1), 0.99)), 1e-12)
     return encode_srgb(albedo / white)
 
 
 def confidence_picture(confidence_map: Float32Array, _: Bools | None = None) -> Picture:
-    """Return a map of probabilities (H, W) as a gray picture (H, W): 0 is black, 1 is white."""
+    """Return a map of probabilities (H, W) as a gray picture (H, W), where 0 is black and 1 is
+    white.
+    """
     return np.rint(255 * confidence_map).astype(np.uint8)
 
 
 def preview_picture(normal_map: Float32Array, mask: Bools) -> Picture:
-    """Return an sRGB picture (H, W, 3) of the surface, matte white under PREVIEW_LIGHT.
+    """Return an sRGB picture (H, W, 3) of the surface in matte white under PREVIEW_LIGHT.
 
     It is black outside the mask.
     """
@@ -74,9 +76,9 @@ def preview_picture(normal_map: Float32Array, mask: Bools) -> Picture:
 
 
 def signed_picture(values: Float32Array, _: Bools, scale: float) -> Picture:
-    """Return values (H, W) or the first of (H, W, C) as a gray picture.
+    """Return values (H, W), or the first channel of (H, W, C), as a gray picture.
 
-    0 and NaN are gray, -scale is black, scale is white.
+    0 and NaN are gray, -scale is black, and scale is white.
     """
     first = values if values.ndim == 2 else values[..., 0]
     share = np.nan_to_num(first / scale).clip(-1, 1)
@@ -99,6 +101,6 @@ def colour_errors(error_map_deg: Floats) -> Picture:
 
 
 def bounding_box(mask: Bools) -> tuple[slice, slice]:
-    """Return the rows and the columns of the smallest box that has all of a mask (H, W)."""
+    """Return the rows and the columns of the bounding box of a mask (H, W)."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)

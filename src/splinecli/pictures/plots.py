@@ -31,8 +31,8 @@ class MethodStyle(NamedTuple):
 
 
 # The colours of Okabe and Ito ("Color Universal Design", 2008), which colour-blind readers can
-# distinguish. Gray replaces their yellow, which is too light for a line on white. The markers help
-# in prints without colour.
+# distinguish. Their yellow is replaced by gray, because it is too light for a line on white. The
+# markers are for prints without colour.
 _COLOURS = [
     "#D55E00",
     "#0072B2",
@@ -48,10 +48,10 @@ _STYLES = tuple(map(MethodStyle, _COLOURS, "osD^vXP*h"))
 
 
 def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
-    """Return the style of each method.
+    """Return the style of each method, which is the same in every plot.
 
-    It depends on the registry's order, so it is the same in every plot. Names that are not in the
-    registry follow in their order.
+    It depends on the order in the registry. Names that are not in the registry follow in their
+    order.
     """
     known = method_names()
     places = known + [name for name in methods if name not in known]
@@ -62,8 +62,7 @@ def png_bytes(figure: Figure, dpi: int) -> bytes:
     """Return a figure as a PNG file, on white regardless of the user's matplotlibrc."""
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        # Characters that the font lacks, as in a capture's name, appear as boxes; that needs no
-        # warning.
+        # Characters that are missing in the font, for example in a capture's name, appear as boxes.
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
         figure.savefig(buffer, format="png", dpi=dpi, facecolor="white")
     return buffer.getvalue()
@@ -74,7 +73,7 @@ def sky_plot(
 ) -> bytes:
     """Return a PNG of the light directions (F, 3) at their (x, y), numbered from 1.
 
-    The rings are angles from the viewing direction, in degrees. With expected errors (F,), a circle
+    The rings are angles from the viewing direction in degrees. With expected errors (F,), a circle
     of this radius is drawn around each light.
     """
     from matplotlib.figure import Figure
@@ -123,14 +122,14 @@ def observation_map_figure(
     """Return a PNG file with a row of observation maps for each of N pixels.
 
     The columns are the sparse map, the dense map of LI-Net, and the map of all lights. Row 0 of a
-    map is y = +1. The maps of a pixel share one frame, either the camera's or the pixel's. Values
-    are relative to the largest observation, from 0 to 1. Empty cells are gray; the circle is the
-    horizon.
+    map is y = +1. All maps of a pixel have the same frame, either the camera's or the pixel's.
+    Values are relative to the largest observation, from 0 to 1. Empty cells are gray; the circle is
+    the horizon.
 
     Args:
         sparse: (N, w, w), NaN in empty cells.
         dense: the same; None for a network without a LI-Net.
-        truth: label of the true maps -> (N, w, w), NaN in cells without a value; may be empty.
+        truth: true maps (N, w, w) by label, NaN in cells without a value; may be empty.
         error_deg: (N,) errors of the estimated normals, in degrees.
         pixels: (N, 2) row and column in the image; None to leave them out.
         title: title of the figure; empty for none.
@@ -147,8 +146,8 @@ def observation_map_figure(
     figure = Figure(figsize=size_inches, layout="constrained")
     if title:
         figure.suptitle(title, fontsize=9, parse_math=False)
-    # In matplotlib, cell k reaches from k - 1/2 to k + 1/2. In the authors' grid, the last column
-    # and the top row represent a single line each.
+    # In matplotlib, cell k extends from k - 1/2 to k + 1/2. In the authors' grid, the last column
+    # and the top row represent single lines.
     size = sparse.shape[1]
     centre, radius = (size / 2 - 0.5, size / 2 - 0.5), size / 2
     if grid == "cnn-ps":
@@ -157,7 +156,7 @@ def observation_map_figure(
     for place, (name, maps) in enumerate(columns.items()):
         for axis, values in zip(axes[:, place], maps, strict=True):
             image = axis.imshow(values, vmin=0, vmax=1, cmap="viridis", interpolation="nearest")
-            # light gray, which the colour scale does not contain
+            # Light gray is not part of the colour scale.
             axis.set(xticks=[], yticks=[], facecolor="0.85")
             line = {"edgecolor": "black", "linewidth": 0.8, "clip_on": False}
             axis.add_patch(Circle(centre, radius, fill=False, **line))
@@ -177,8 +176,8 @@ Columns = Mapping[str, Sequence[float | None]]
 def training_figure(columns: Columns) -> Figure:
     """Return a figure of the loss, the angular errors and the map errors against the step.
 
-    `columns` has the columns of metrics.csv by name, all of one length; None marks a value that was
-    not computed.
+    `columns` contains the columns of metrics.csv by name, all of the same length; None marks a
+    value that was not computed.
     """
     from matplotlib.figure import Figure
 
@@ -196,7 +195,7 @@ def training_figure(columns: Columns) -> Figure:
         pairs = zip(columns["step"], columns[name], strict=True)
         points = [(step, value) for step, value in pairs if value is not None]
         if points:
-            style = "o" if len(points) == 1 else style  # one point does not make a line
+            style = "o" if len(points) == 1 else style  # a single point is not a line
             axes.plot(*zip(*points, strict=True), style, label=label, alpha=alpha)
     titles = ("loss", "mean angular error (deg)", "mean error of the dense map")
     for axes, title in zip((loss, angle, maps), titles, strict=True):
@@ -208,7 +207,7 @@ def training_figure(columns: Columns) -> Figure:
         axes.legend()
         values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.lines])
         if (values > 0).all() and values.max() > 20 * values.min():
-            axes.set_yscale("log")  # for values that span more
+            axes.set_yscale("log")
     return figure
 
 
@@ -225,11 +224,11 @@ def method_maps(
 ) -> bytes:
     """Return a PNG file of the ground truth and the maps of several methods, side by side.
 
-    Each column has a normal map above an error map. Normals have the colours (n + 1) / 2, errors
-    the scale of colour_errors from 0 to TOP_DEG; other pixels are white. The maps are cropped to
-    the mask's bounding box. Small maps are enlarged by a whole factor and large ones averaged, so
-    that the picture stays below 4000 pixels wide. The MAE below each method covers the pixels that
-    have errors.
+    Each column has a normal map above an error map. Normals have the colours (n + 1) / 2, and
+    errors the scale of colour_errors from 0 to TOP_DEG; other pixels are white. The maps are
+    cropped to the mask's bounding box. Small maps are enlarged by an integer factor and large ones
+    averaged, so that the picture stays below 4000 pixels wide. The MAE below each method refers to
+    the pixels that have errors.
 
     The ground truth (H, W, 3) is unit, or zero where it is unknown; the mask (H, W) is not empty.
     Each method, in the order of the columns, has normals (H, W, 3) and errors (H, W), NaN in pixels
@@ -278,9 +277,8 @@ def method_maps(
 def _draw_bar(
     figure: Figure, left: int, bottom: int, height: int, text: int, *, side: int = -1
 ) -> None:
-    """Draw a vertical colour bar of errors, with labels and title on one side.
-
-    It is `text` pixels wide.
+    """Draw a vertical colour bar of errors, `text` pixels wide, with labels and title on one
+    side.
     """
     inset = text // 2  # room for half a label at either end
     length, edge = height - 2 * inset, left + text * (side > 0)
@@ -294,9 +292,9 @@ def _draw_bar(
 
 
 def error_map_picture(error_map_deg: Floats) -> Picture:
-    """Return an error map (H, W) in degrees as an RGB picture with a colour bar at its right.
+    """Return an error map (H, W) in degrees as an RGB picture with a colour bar on its right.
 
-    A map of fewer than 256 rows is enlarged by a whole factor while its width stays within 1024
+    A map of fewer than 256 rows is enlarged by an integer factor while its width stays within 1024
     pixels, then padded to 256 rows.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -322,9 +320,9 @@ def error_map_picture(error_map_deg: Floats) -> Picture:
 def calibration_picture(balls: Sequence[BallCalibration]) -> bytes:
     """Return a PNG file with all images of all balls, in rows of up to six.
 
-    The green circle is the outline and the red one the highlight. The red line from the centre to
-    the highlight points towards the lamp. The title has the number of the image, from 1, and the
-    light direction x, y, z.
+    The green circle is the outline, and the red one the highlight. The red line from the centre to
+    the highlight points towards the lamp. The title contains the number of the image, from 1, and
+    the light direction x, y, z.
     """
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle
@@ -379,9 +377,9 @@ def _write(
 
 
 def _text_height(width: int, lines: Sequence[str], *, most: int = 36) -> int:
-    """Return a text height in pixels at which each line fits into the width.
+    """Return a text height in pixels for which each line fits into the width.
 
-    Short lines do not fill it.
+    Short lines do not fill the width.
     """
     longest = max(18, *(len(line) for line in lines))
     # characters are 0.62 of their height wide
@@ -389,11 +387,11 @@ def _text_height(width: int, lines: Sequence[str], *, most: int = 36) -> int:
 
 
 def _scale(height: int, width: int, columns: int) -> float:
-    """Return the factor of enlargement: a whole number, or less than 1."""
-    # All columns without gaps are 3600 pixels wide at most, so the picture stays below 4000. A map
-    # has up to 1200 rows.
+    """Return the scale factor, which is an integer or less than 1."""
+    # The columns without gaps are at most 3600 pixels wide, and the picture less than 4000. A map
+    # has at most 1200 rows.
     most = min(3600 / columns / width, 1200 / height)
-    # Small maps are enlarged while their longer side stays within 240 pixels.
+    # Small maps are enlarged as long as their longer side stays within 240 pixels.
     return most if most < 1 else max(1, min(int(most), 240 // max(height, width)))
 
 

@@ -304,9 +304,12 @@ def infer_capture(
             (BusyError).
 
     Examples:
-        >>> from pathlib import Path >>> from splinecli.pipeline.infer import infer_capture >>> from
-        splinecli.pipeline.infer_options import InferOptions >>> options = InferOptions(method="ls",
-        output="results") >>> infer_capture(Path("examples/medallion"), options)["n_pixels"] 11836
+        >>> from pathlib import Path
+        >>> from splinecli.pipeline.infer import infer_capture
+        >>> from splinecli.pipeline.infer_options import InferOptions
+        >>> options = InferOptions(method="ls", output="results")
+        >>> infer_capture(Path("examples/medallion"), options)["n_pixels"]
+        11836
     """
     name = capture_name(folder)
     with held_results(name, options, observer) as target, observer.progress(name, 1.0) as show:

@@ -1,1 +1,1 @@
-"""Surfaces from normals: integration to heights, triangle meshes, and their files."""
+"""Surfaces from normals: integration into heights, triangle meshes, and their files."""

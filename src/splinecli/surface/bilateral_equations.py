@@ -1,7 +1,7 @@
 """The equations of bilateral normal integration, their weights, and their linear solver.
 
-The unknown is one height h per pixel, in pixels: z itself for an orthographic camera, -f log(depth)
-for a pinhole camera of focal length f. The normal n of a pixel fixes how h changes towards the next
+Each pixel has one unknown height h, in pixels: z for an orthographic camera, -f log(depth) for a
+pinhole camera with focal length f. The normal n of a pixel determines how h changes to the next
 pixel on the right and below:
 
     facing * (h' - h) + slant = 0,      facing = -n.r,   slant = f n.dr.
@@ -9,14 +9,13 @@ pixel on the right and below:
 Here r is the ray through the pixel, scaled to z = -1, and dr its change to the neighbour.
 Orthographic rays are all (0, 0, -1), and f dr is one pixel.
 
-Away from edges, the equation of a pixel applies to both its neighbours on an axis. At an edge it
-applies to only one neighbour. The method therefore weights the squared residual towards each side
-by
+Away from edges, the equation of a pixel applies to both its neighbours on an axis. At an edge, it
+applies to only one of them. Therefore, the squared residual towards each side is weighted by
 
     share = sigmoid(discontinuity * facing^2 * (gap towards the other side^2 - gap towards this
     side^2)).
 
-A side without a neighbour is treated as a gap of zero.
+On a side without a neighbour, the gap is zero.
 """
 
 from __future__ import annotations
@@ -32,11 +31,12 @@ from splinecli.maths.pixel_grid import focal_length, pixel_rays, ray_basis
 
 PixelNumbers = NDArray[np.int32]
 DISCONTINUITY = 2.0  # how easily the surface tears, as in the paper
-_MOST_STEPS = 5_000  # of conjugate gradients, as in the paper's code
+_MOST_STEPS = 5_000  # steps of conjugate gradients, as in the paper's code
 
-# The cosine between a normal and its ray at 87 degrees. Beyond it, a degree changes the slope by a
-# third or more, so the normal says nothing reliable about the height. The equations of the
-# neighbours fix the height of such pixels, and of pixels whose normals face away from the camera.
+# The cosine between a normal and its ray at 87 degrees. Beyond this angle, one degree changes the
+# slope by a third or more, so the normal is not a reliable indication of the height. The heights of
+# such pixels, and of pixels whose normals face away from the camera, are determined by their
+# neighbours.
 SMALLEST_COSINE = 0.05
 
 
@@ -44,11 +44,11 @@ SMALLEST_COSINE = 0.05
 class BilateralEquations:
     """The equations of P pixels."""
 
-    facing: Float64Array  # (P,), zero where the normal is not usable
-    # (P,) along the rows and (P,) along the columns, zero where the normal is not usable
+    facing: Float64Array  # (P,), zero for unusable normals
+    # (P,) along the rows and (P,) along the columns, zero for unusable normals
     slants: tuple[Float64Array, Float64Array]
-    # the pairs of neighbours along the rows, and those along the columns. Each is (E,) pixel
-    # numbers on the left or above, and (E,) pixel numbers on the right or below.
+    # pairs of neighbours along the rows, and along the columns: (E,) indices of the left or upper
+    # pixels, and (E,) indices of the right or lower pixels
     pairs: tuple[tuple[PixelNumbers, PixelNumbers], tuple[PixelNumbers, PixelNumbers]]
 
     @classmethod
@@ -78,11 +78,11 @@ class BilateralEquations:
     def weigh(
         self, heights: Float64Array, discontinuity: float
     ) -> tuple[Float64Array, Float64Array]:
-        """Return the weights of all pairs at the heights (P,), and their flows.
+        """Return the weights and the flows (E,) of all pairs at the heights (P,).
 
-        The weights (E,) are half the second derivative of the sum of squares with respect to the
-        gap of a pair, and the flows (E,) half the first derivative. Pairs along the rows come
-        first, then those along the columns.
+        For the gap of a pair, the weight is half the second derivative of the sum of squares, and
+        the flow half its first derivative. Pairs along the rows come first, then pairs along the
+        columns.
         """
         from scipy.special import expit
 
@@ -105,7 +105,7 @@ class BilateralEquations:
 
 
 class LaplacianSolver:
-    """Solve the normal equations of pairs of neighbours repeatedly, with changing weights.
+    """Solves the normal equations of pairs of neighbours repeatedly, with changing weights.
 
     The matrix is a weighted Laplacian of the graph of pixels.
     """
@@ -116,8 +116,7 @@ class LaplacianSolver:
         self._near = np.concatenate([near for near, _ in pairs])
         self._far = np.concatenate([far for _, far in pairs])
         self._n_pixels = n_pixels
-        # The matrix always has the same pattern. A matrix of positions records the place of each
-        # value.
+        # The sparsity pattern is constant. A matrix of positions maps each value to its place.
         pixels = np.arange(n_pixels, dtype=np.int32)
         rows = np.concatenate((self._near, self._far, pixels))
         columns = np.concatenate((self._far, self._near, pixels))
@@ -125,7 +124,9 @@ class LaplacianSolver:
         self._pattern = csr_matrix((positions, (rows, columns)), shape=(n_pixels, n_pixels))
 
     def forces(self, flows: Float64Array) -> Float64Array:
-        """Return the forces on the heights (P,): half the negative derivative of the cost."""
+        """Return the forces on the heights (P,), which are half the negative derivative of the
+        cost.
+        """
         return self._sum(flows, self._near) - self._sum(flows, self._far)
 
     def solve(
@@ -136,20 +137,19 @@ class LaplacianSolver:
         pull: Float64Array | float = 0.0,
         least: float = 0.0,
     ) -> Float64Array:
-        """Return the change of heights (P,) that minimises the sum of squares.
+        """Return the change of the heights (P,) that minimises the sum of squares.
 
         Weights (E,) are half the second derivative with respect to the gap of each pair, and
         `forces` (P,) half the negative first derivative with respect to each height. `pull` (P,) is
-        half the second derivative of the cost that pulls each height to a known one; `forces`
-        include its pull. The norm of the remaining forces is at most `least`. With 0, the solution
-        is accurate to seven digits.
+        half the second derivative of the cost that pulls the heights to known ones; `forces` must
+        include it. The norm of the remaining forces is at most `least`. If it is 0, the solution is
+        accurate to seven digits.
         """
         from scipy.sparse import csr_matrix, diags_array
         from scipy.sparse.linalg import cg
 
-        # Small costs on the change of gaps and of heights in one solve; the equations have costs up
-        # to 1. Pixels that no equation ties to others keep their heights, and the system is never
-        # singular.
+        # Small costs on changes of the gaps and heights keep the system from being singular, so
+        # pixels without equations keep their heights. The equations have costs up to 1.
         weights = weights + 1e-10
         diagonal = self._sum(weights, self._near) + self._sum(weights, self._far) + 1e-12 + pull
         values = np.concatenate((-weights, -weights, diagonal))[self._pattern.data]
@@ -158,14 +158,14 @@ class LaplacianSolver:
         )
         change: Float64Array
         if least > 0:
-            # not multigrid, which would move whole parts even if their forces are that small
+            # Multigrid would move whole parts even if the forces on them are this small.
             inverse = diags_array(1 / np.maximum(diagonal, 1e-5))
             change, _ = cg(matrix, forces, rtol=0, atol=least, maxiter=_MOST_STEPS, M=inverse)
             return change
         from pyamg import ruge_stuben_solver
 
-        # On these matrices, classical multigrid is faster than smoothed aggregation, both to set up
-        # and to use.
+        # For these matrices, classical multigrid is faster than smoothed aggregation, including its
+        # setup.
         multigrid = ruge_stuben_solver(matrix).aspreconditioner()
         change, _ = cg(matrix, forces, rtol=1e-7, maxiter=200, M=multigrid)
         return change

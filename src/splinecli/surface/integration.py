@@ -1,10 +1,10 @@
 """Bilateral normal integration: heights from normals, with discontinuities at the edges of objects.
 
 Cao, Santo, Shi, Okura and Matsushita, Bilateral normal integration, ECCV 2022. Large maps are
-integrated from coarse to fine. A coarse surface from another source may give the shape at
-wavelengths above some pixels (Nehab, Rusinkiewicz, Davis and Ramamoorthi, Efficiently combining
-positions and normals for precise 3D geometry, SIGGRAPH 2005). `bilateral_equations` has the
-equations and the linear solver. Frame: x right, y up, z to the camera (docs/files-and-frames.md).
+integrated from coarse to fine. A coarse surface from another source may determine the shape at long
+wavelengths (Nehab, Rusinkiewicz, Davis and Ramamoorthi, Efficiently combining positions and normals
+for precise 3D geometry, SIGGRAPH 2005). `bilateral_equations` contains the equations and the linear
+solver. Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from splinecli.surface.bilateral_equations import (
 )
 from splinecli.system.progress import Progress, ignore
 
-STILL = 0.01  # pixels: the rms movement at which the surface is finished
-# Forces on the heights below this share of those on a flat surface move nothing (the tolerance of
-# the paper's code). Of a part that is torn off all around, they are no more than this.
+STILL = 0.01  # rms movement in pixels below which the surface is finished
+# Tolerance for the forces on the heights, relative to a flat surface, as in the paper's code. The
+# forces on a part that is torn off all around are not larger.
 LEAST_FORCE = 1e-3
 COARSEST = 64_000  # pixels; larger maps start from blocks of 2 x 2 pixels
 SOLVES_OF_COARSEST = 150
-# of a prior in pixels or millimetres; above it, float32 only represents whole numbers
+# largest value of a prior in pixels or millimetres, above which float32 only represents integers
 _LARGEST_VALUE = 1e7
 RELIEF_WIDTH = 64.0  # pixels: the wavelength at which the high-pass filter halves the amplitude
 
@@ -47,14 +47,13 @@ def integrate_normals(
     prior_detail: float | None = None,
     progress: Progress = ignore,
 ) -> Float64Array:
-    """Integrate a normal map (H, W, 3) into a height or depth map (H, W).
-
-    The result is float64, NaN outside the mask.
+    """Integrate a normal map (H, W, 3) into a height or depth map (H, W) float64, NaN outside the
+    mask.
 
     For an orthographic camera, the result is the height towards the camera in pixels. With a camera
-    matrix, it is the positive depth along the viewing axis, of unknown scale. Normals do not fix
-    the offset between parts that share no side of a pixel: each part has mean height 0, or
-        geometric mean depth 1.
+    matrix, it is the positive depth along the viewing axis, of unknown scale. Normals do not
+    determine the offset between parts that are not connected by a side of a pixel, so each part has
+    mean height 0 or geometric mean depth 1.
 
     Args:
         normal_map: unit normals in the mask, row 0 at the top; x right, y up, z to the camera.
@@ -65,11 +64,12 @@ def integrate_normals(
         discontinuity: sensitivity to discontinuities. 0 is least squares, which gives a continuous
             surface.
         prior: (H, W), a coarse surface from another source, such as a scanner: heights or depths
-            like the result, NaN where it is not known. The result has its large-scale shape, its
+            like the result, NaN where they are unknown. The result has its large-scale shape, its
             offset and, for depths, its scale.
-        prior_detail: the wavelength in pixels at which prior and normals have equal weight. Longer
-            waves follow the prior. None for 15 % of the root of the mask's area.
-        progress: receives shares of the work, which may add up to less than 1.
+        prior_detail: the wavelength in pixels at which prior and normals have equal weight. At
+            longer wavelengths, the prior dominates. None for 15 % of the square root of the mask's
+            area.
+        progress: is called with shares of the work, which may add up to less than 1.
 
     Raises:
         UsageError: the shapes or types of the arrays do not match, or an option is out of range.
@@ -84,7 +84,9 @@ def integrate_normals(
             raise UsageError(f"the normal map has shape {normal_map.shape}, expected (H, W, 3)")
         mask = np.asarray(np.isfinite(normal_map).all(axis=2) & normal_map.any(axis=2))
         if not mask.any():
-            raise InputError("the normal map has no normal: all vectors are zero or not finite")
+            raise InputError(
+                "the normal map has no normals, because all vectors are zero or not finite"
+            )
     _check_maps(normal_map, mask)
     known = None
     if prior is not None:
@@ -104,10 +106,10 @@ def integrate_normals(
 def relief_of_normals(normal_map: Float32Array, mask: Bools) -> Float32Array:
     """Return the relief (H, W) in pixels, positive towards the camera; NaN outside the mask (H, W).
 
-    Without the large-scale shape, it shows dents, scratches and tool marks: the surface of the
-    normals (H, W, 3), unit in the mask, x right, y up, z to the camera, pulled to height zero. The
-    filter's gain at k radians per pixel is k^2 / (k^2 + (2 pi / RELIEF_WIDTH)^2). Raises InputError
-    if the mask is empty.
+    The relief shows dents, scratches and tool marks without the large-scale shape. It is the
+    surface of the normals (H, W, 3), pulled to height zero. At k radians per pixel, the gain of
+    this filter is k^2 / (k^2 + (2 pi / RELIEF_WIDTH)^2). The normals are unit in the mask; x right,
+    y up, z to the camera. Raises InputError if the mask is empty.
     """
     flat = np.zeros(mask.shape)
     return integrate_normals(
@@ -116,7 +118,9 @@ def relief_of_normals(normal_map: Float32Array, mask: Bools) -> Float32Array:
 
 
 class _Surface(NamedTuple):
-    """The input of integrate_normals for the pixels of a mask. The prior has heights (P,)."""
+    """The input of integrate_normals for the pixels of a mask. The prior is given as heights
+    (P,).
+    """
 
     normal_map: Floats
     mask: Bools
@@ -145,18 +149,16 @@ def _integrate(
 ) -> Float64Array:
     """Return the heights (P,) of the mask's pixels, with the method of integrate_normals.
 
-    They are finished when they move by less than `still`, the rms in pixels.
-
-    A large map starts from the heights of blocks of 2 x 2 pixels: where the surface tears, and by
-    how much, is found at the coarsest scale, where many solves take little time. Finer scales
-    follow the edges.
+    They are finished when they move by less than `still`, the rms in pixels. A large map starts
+    from the heights of blocks of 2 x 2 pixels, so that the tears of the surface and their sizes are
+    found at the coarsest scale, where many solves take little time. Finer scales follow the edges.
     """
     normal_map, mask, camera_matrix, prior, prior_detail = surface
     equations = BilateralEquations.from_normals(normal_map, mask, camera_matrix)
     n_pixels = len(equations.facing)
     heights = np.zeros(n_pixels)
     most, own_share = SOLVES_OF_COARSEST if discontinuity > 0 else 1, 1.0
-    is_huge = n_pixels > 8_000_000  # larger maps have the heights of their blocks, interpolated
+    is_huge = n_pixels > 8_000_000  # the heights of blocks are only interpolated
     if is_huge or (n_pixels > COARSEST and discontinuity > 0):
         blocks = Blocks.of_step(mask, 2)
         coarse = surface.of_blocks(blocks, keep_edges=not is_huge)
@@ -169,13 +171,13 @@ def _integrate(
             return heights
         most = min(20, max(4, 1_000_000 // n_pixels))
     solver = LaplacianSolver(equations.pairs, n_pixels)
-    # Normals determine gaps, which are smaller at longer wavelengths. At this one, both have the
-    # same weight.
+    # Normals determine gaps, which are smaller at longer wavelengths. At this wavelength, prior and
+    # normals have the same weight.
     pull = 0.0 if prior is None else (2 * np.pi / prior_detail) ** 2 * np.isfinite(prior)
     known_heights = 0.0 if prior is None else np.nan_to_num(prior)
     # At heights of zero, all weights are equal, so the first solve is least squares. If the surface
-    # then tears around a part, hardly any force holds it, and exact solves would let it drift by
-    # several pixels. Small forces therefore move nothing.
+    # then tears around a part, the forces on it are tiny, and exact solves would let it drift by
+    # several pixels. Therefore, small forces are ignored.
     of_flat = solver.forces(equations.weigh(np.zeros(n_pixels), 0.0)[1]) + pull * known_heights
     least = LEAST_FORCE * float(np.linalg.norm(of_flat))
     for number in range(most):
@@ -192,11 +194,11 @@ def _integrate(
 def _normals_of(
     blocks: Blocks, normals: Float64Array, mask: Bools, *, keep_edges: bool
 ) -> Float64Array:
-    """Return the normals (p, 3) of blocks from those of their pixels (P, 3).
+    """Return the normals (p, 3) of blocks from the normals of their pixels (P, 3).
 
-    They are the normals of the mean slope, or the steepest ones. With keep_edges, a block that
-    contains an edge has the steepest normal, which belongs to the rim. The mean over an edge would
-    be a slope that joins the two separate sides.
+    A block has the normal of the mean slope. With keep_edges, a block that contains an edge has its
+    steepest normal instead, which belongs to the rim, because a mean over the edge would connect
+    the two sides by a slope.
     """
     slopes = normals / np.maximum(normals[:, 2:], SMALLEST_COSINE)
     mean = unit(blocks.average(slopes, mask))
@@ -208,16 +210,17 @@ def _normals_of(
     by_steepness = np.lexsort((normals[:, 2], block))
     first = np.searchsorted(block[by_steepness], np.arange(len(mean)))
     steepest = normals[by_steepness[first]]
-    # A block that contains an edge has a normal so far from their mean.
+    # A block contains an edge if a normal deviates from the mean by more than this angle.
     mixed = (closest < np.cos(np.radians(20.0))) & (steepest[:, 2] > SMALLEST_COSINE)
     return np.asarray(np.where(mixed[:, None], steepest, mean))
 
 
 def _heights_of_prior(prior: Floats, mask: Bools, camera_matrix: Floats | None) -> Float64Array:
-    """Return a prior as heights (P,) in the unit of the equations, NaN where unknown."""
+    """Return a prior as heights (P,) in the unit of the equations, NaN where it is unknown."""
     if prior.shape != mask.shape:
-        expected = f"expected {mask.shape} as in the normal map"
-        raise UsageError(f"the prior has shape {prior.shape}, {expected}")
+        raise UsageError(
+            f"the prior has shape {prior.shape}, expected {mask.shape} as in the normal map"
+        )
     heights = prior[mask].astype(np.float64)
     beyond = np.isfinite(heights) & (np.abs(heights) > _LARGEST_VALUE)
     _refuse(beyond, mask, f"beyond {_LARGEST_VALUE:g}")
@@ -231,19 +234,19 @@ def _heights_of_prior(prior: Floats, mask: Bools, camera_matrix: Floats | None) 
     return heights
 
 
-def _refuse(wrong: Bools, mask: Bools, what: str) -> None:
-    """Raise InputError if any value (P,) of a prior over a mask (H, W) is wrong: `what`."""
+def _refuse(wrong: Bools, mask: Bools, reason: str) -> None:
+    """Raise InputError with this reason if a value (P,) of a prior in a mask (H, W) is wrong."""
     if wrong.any():
         row, column = np.argwhere(mask)[wrong.argmax()]
-        problem = f"{np.count_nonzero(wrong)} of {wrong.size} values of the prior are {what}"
+        problem = f"{np.count_nonzero(wrong)} of {wrong.size} values of the prior are {reason}"
         raise InputError(
             f"{problem}, the first in row {row}, column {column}",
-            hint="Give them in the unit of the result, and NaN where nothing is known",
+            hint="Use the unit of the result, and NaN where the value is unknown",
         )
 
 
 def _check_prior(surface: _Surface) -> None:
-    """Raise InputError for a prior that is negated, in another unit, or has outliers."""
+    """Raise InputError for a prior that is negated, in another unit, or contains outliers."""
     step = max(1, round(min(surface.prior_detail, *surface.mask.shape) / 4))
     coarse = surface.of_blocks(Blocks.of_step(surface.mask, step), keep_edges=False)
     equations = BilateralEquations.from_normals(
@@ -262,10 +265,10 @@ def _check_prior(surface: _Surface) -> None:
     steeper = both / max(float(wanted @ wanted), 1e-12)
     # A blurred prior is flatter than the normals.
     if abs(correlation) > 0.3 and not 0.2 < steeper < 5.0:  # slopes of prior and normals
-        hint = "Give heights towards the camera, or depths with a camera matrix, in the unit of the"
         raise InputError(
             f"the prior is {steeper:.2g} times as steep as the normals, expected about 1",
-            hint=f"{hint} result",
+            hint="Use heights towards the camera, or depths with a camera matrix, in the unit of"
+            " the result",
         )
     assert surface.prior is not None
     farthest = 3.0 * max(np.ptp(np.flatnonzero(surface.mask.any(axis=axis))) + 1 for axis in (0, 1))
@@ -281,7 +284,7 @@ def _depth_map(
     parts = label(mask)[0][mask] - 1  # label joins pixels that share a side, as the equations do
     offsets = np.bincount(parts, heights) / np.bincount(parts)
     if prior is not None:
-        # A part that the prior does not cover has the mean height of the known pixels.
+        # Parts without a prior have the mean height of the known pixels.
         is_known = np.bincount(parts, np.isfinite(prior)) > 0
         offsets = np.where(is_known, 0, offsets - np.nanmean(prior))
     heights = heights - offsets[parts]
@@ -296,14 +299,15 @@ def _check_maps(normal_map: Floats, mask: Bools) -> None:
     if mask.ndim != 2 or mask.dtype != np.bool_:
         raise UsageError(f"the mask is {mask.dtype} {mask.shape}, expected bool (H, W)")
     if normal_map.shape != (*mask.shape, 3):
-        expected = f"expected {(*mask.shape, 3)} for this mask"
-        raise UsageError(f"the normal map has shape {normal_map.shape}, {expected}")
+        raise UsageError(
+            f"the normal map has shape {normal_map.shape}, expected {(*mask.shape, 3)} for this"
+            " mask"
+        )
     if not mask.any():
         raise InputError("the mask is empty", hint="Mark the pixels of the object in it")
     wrong = mask.copy()
     length = np.linalg.norm(normal_map[mask].astype(np.float64), axis=1)
-    # The tolerance accepts normals from float16 and 8-bit images, and refuses zero vectors. NaN is
-    # wrong, too.
+    # The tolerance accepts normals from float16 and 8-bit images, but not zero vectors or NaN.
     wrong[mask] = ~(np.abs(length - 1) <= 1e-2)
     if wrong.any():
         row, column = np.argwhere(wrong)[0]

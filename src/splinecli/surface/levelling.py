@@ -1,4 +1,4 @@
-"""Level a surface: remove the slope of its main plane, or of a plane through points."""
+"""Level a surface by removing the slope of its main plane, or of a plane through given points."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from splinecli.maths import Bools, Float32Array, Float64Array, Floats
 from splinecli.maths.normals import unit
 
 _FITS = 50
-_CUT = 2.5  # residuals have half of their weight at so many robust standard deviations
-_AROUND = 2  # pixels around a given point whose median height is taken
+_CUT = 2.5  # robust standard deviations at which the weight of a residual is halved
+_AROUND = 2  # distance in pixels around a given point within which the median height is used
 
 
 def plane_slopes(
@@ -25,7 +25,7 @@ def plane_slopes(
     Args:
         points: columns and rows of at least three points on the plane, or () for the dominant plane
             of the surface (iteratively reweighted least squares with Cauchy's weights).
-        aspect: height of a pixel in widths, the unit of the heights.
+        aspect: height of a pixel relative to its width, which is the unit of the heights.
 
     Raises:
         UsageError: a point is not on the object, or the points or pixels are on one line.
@@ -47,9 +47,9 @@ def plane_slopes(
     terms = np.stack((x, y, np.ones(len(z))), axis=1)
     sizes = np.linalg.svd(terms[:, :2], compute_uv=False)
     if sizes[-1] <= 1e-2 * sizes[0]:  # both are 0 for a single point
-        what = "points of --level" if points else "pixels of the object"
+        given = "points of --level" if points else "pixels of the object"
         hint = "Choose points that span a plane" if points else "Leave --level out"
-        raise UsageError(f"the {what} are in a line", hint=hint)
+        raise UsageError(f"the {given} are on one line", hint=hint)
     weights, plane = np.ones(len(z)), np.zeros(3)
     for _ in range(1 if points else _FITS):
         weighted = terms * weights[:, None]
@@ -62,10 +62,7 @@ def plane_slopes(
 def level_heights(
     heights: Floats, slopes: tuple[float, float], *, aspect: float = 1.0
 ) -> Float64Array:
-    """Subtract a plane with these slopes from heights (H, W).
-
-    The plane has the mean height 0 on the object.
-    """
+    """Return heights (H, W) minus a plane with these slopes, whose mean on the object is 0."""
     rows, columns = np.indices(heights.shape)
     plane = np.asarray(slopes[0] * columns - slopes[1] * aspect * rows, np.float64)
     return np.asarray(heights - (plane - plane[np.isfinite(heights)].mean()), np.float64)

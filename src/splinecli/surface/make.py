@@ -1,4 +1,4 @@
-"""The surface of a normal map: integrated, levelled, in millimetres, with its mesh and textures."""
+"""The surface of a normal map with its mesh and textures, optionally levelled or in millimetres."""
 
 import math
 from dataclasses import dataclass, replace
@@ -23,17 +23,19 @@ from splinecli.system.progress import Progress, ignore
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSettings:
-    """How a surface is made from normals; see integrate_normals, surface_mesh and decimated_mesh.
+    """How a surface is computed from normals; see integrate_normals, surface_mesh and
+    decimated_mesh.
 
-    pixel_size_mm: the width of a pixel on the object, for a surface in millimetres. None for a
-        surface in pixels or, with a camera matrix, in mean depths.
-    n_triangles: None keeps all triangles.
-    prior: in the unit of the surface. With a camera matrix, it is in millimetres, so pixel_size_mm
-        is not needed.
-    level: points or (), as in plane_slopes; None leaves the surface as it is.
-    pixel_aspect: height of a pixel in widths.
-    solid_mm: the thickness of a closed mesh at its lowest point (close_mesh), for a surface in
-        millimetres. None leaves the mesh open.
+    Args:
+        pixel_size_mm: the width of a pixel on the object, for a surface in millimetres. None for a
+            surface in pixels or, with a camera matrix, in mean depths.
+        n_triangles: None keeps all triangles.
+        prior: in the unit of the surface. With a camera matrix, it is in millimetres, so
+            pixel_size_mm is not needed.
+        level: points or (), as in plane_slopes; None does not level the surface.
+        pixel_aspect: height of a pixel relative to its width.
+        solid_mm: the thickness of a closed mesh at its lowest point (close_mesh), for a surface in
+            millimetres. None leaves the mesh open.
     """
 
     discontinuity: float = DISCONTINUITY
@@ -47,19 +49,20 @@ class SurfaceSettings:
     solid_mm: float | None = None
 
     def check(self, camera_matrix: Floats | None) -> None:
-        """Raise UsageError for settings that need an orthographic camera, if there is a matrix.
+        """Raise UsageError for a solid without a scale, and for settings that need an orthographic
+        camera.
 
-        A solid needs a surface in millimetres.
+        The camera matrix is None for an orthographic camera.
         """
         has_scale = self.prior is not None and camera_matrix is not None
         if self.solid_mm is not None and self.pixel_size_mm is None and not has_scale:
             raise UsageError(
                 f"--solid {self.solid_mm:g} is in millimetres, but the surface has no scale",
-                hint="Give the width of a pixel on the object with --pixel-size",
+                hint="Add --pixel-size with the width of a pixel on the object",
             )
         option, hint = "--level", "Level the mesh in another program"
         if self.level is None:
-            option, hint = "--pixel-aspect", "Its fx and fy describe the pixels"
+            option, hint = "--pixel-aspect", "The aspect follows from fx and fy of the matrix"
         if camera_matrix is not None and (self.level is not None or self.pixel_aspect != 1):
             raise UsageError(
                 f"{option} needs an orthographic camera, but there is a camera matrix", hint=hint
@@ -76,7 +79,7 @@ def make_surface(
 ) -> tuple[Surface, dict[str, Any]]:
     """Return the surface of a normal map, and its entry in the reports.
 
-    The arguments and errors are those of integrate_normals, surface_mesh and decimated_mesh. Raises
+    For the arguments and errors, see integrate_normals, surface_mesh and decimated_mesh. Raises
     UsageError if settings and camera do not match.
     """
     settings.check(camera_matrix)
@@ -117,7 +120,7 @@ def make_surface(
         depth, mesh = depth * scale, replace(mesh, vertices=mesh.vertices * np.float32(scale))
     if settings.solid_mm is not None:
         mesh = close_mesh(mesh, settings.solid_mm, perspective=camera_matrix is not None)
-    # the digits of float32
+    # rounded to the precision of float32
     low, high = (float(f"{end(depth):.7g}") for end in (np.nanmin, np.nanmax))
     report = SurfaceFacts(
         camera="orthographic" if camera_matrix is None else "perspective",
@@ -139,7 +142,7 @@ def make_surface(
 
 
 def _stretched(normal_map: Float32Array, mask: Bools, aspect: float) -> Float32Array:
-    """Return the normals of a surface that has the same heights on square pixels."""
+    """Return the normals of a surface with the same heights on square pixels."""
     stretched = np.zeros_like(normal_map)
     stretched[mask] = unit_vectors(normal_map[mask] * np.array((1, aspect, 1), np.float32))
     return stretched

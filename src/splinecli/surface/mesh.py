@@ -1,14 +1,14 @@
-"""Triangle meshes of height and depth maps, also decimated with a texture of the normals.
+"""Triangle meshes of height and depth maps, optionally decimated with a texture of the normals.
 
 Frame: x right, y up, z to the camera (docs/files-and-frames.md). For an orthographic camera,
 coordinates are in pixels and the origin is the centre of the image. For a pinhole camera, they are
 in the unit of the depth and the origin is the camera.
 
-The texture of a mesh of fewer triangles has measured normals in the tangent frame of the coarser
+The texture of a decimated mesh contains the measured normals in the tangent frame of the coarser
 mesh. A viewer interpolates the unit normal N and the tangent T of the vertices over a triangle and
 scales both to unit length. The bitangent is B = N x T, which points up in the image. A texel (x, y,
-z) then represents the normal x T + y B + z N, and its colour is (x + 1) / 2 and so on (glTF 2.0,
-section 3.9.3).
+z) represents the normal x T + y B + z N, and its colour is (x + 1) / 2 and so on (glTF 2.0, section
+3.9.3).
 """
 
 from collections.abc import Iterator
@@ -28,29 +28,29 @@ from splinecli.system.machine import import_extra
 
 @dataclass(frozen=True)
 class SurfaceMesh:
-    """A triangle mesh with the textures of its image."""
+    """A triangle mesh with textures."""
 
     vertices: Float32Array  # (V, 3) float32
-    # (T, 3) int32, the numbers of three vertices each, counter-clockwise as viewed by the camera
+    # (T, 3) int32, indices of three vertices each, counter-clockwise in the camera's view
     triangles: NDArray[np.int32]
     normals: Float32Array  # (V, 3) float32, unit
-    # (V, 2) float32, the places of the vertices in the textures: u from 0 at the left to 1 at the
-    # right, v from 0 at the top to 1 at the bottom, as in glTF
+    # (V, 2) float32, texture coordinates of the vertices: u from 0 at the left to 1 at the right, v
+    # from 0 at the top to 1 at the bottom, as in glTF
     uvs: Float32Array
     texture: Picture | None = None  # (H, W, 3) uint8, sRGB colours, or None
-    # (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; or None if
-    # `normals` are exact.
+    # (H, W, 3) uint8, normals in the frame of tangent, bitangent and normal, green up; None if
+    # `normals` are exact
     normal_texture: Picture | None = None
-    # (H, W, 3) uint8, linear, roughness in green and metalness in blue, as in glTF; or None for a
+    # (H, W, 3) uint8, linear, roughness in green and metalness in blue, as in glTF; None for a
     # matte surface
     gloss: Picture | None = None
-    # (H, W) float32, 0.5 for a reflectance of 4 % at normal incidence; None for that everywhere
+    # (H, W) float32, 0.5 for a reflectance of 4 % at normal incidence; None for 0.5 everywhere
     specular: Float32Array | None = None
     tangents: Float32Array | None = None  # (V, 3) float32, unit; only with a normal texture
 
     @property
     def colours(self) -> Picture | None:
-        """The colours of the vertices in the texture, (V, 3) uint8."""
+        """The colours of the vertices from the texture, (V, 3) uint8."""
         if self.texture is None:
             return None
         height, width = self.texture.shape[:2]
@@ -67,7 +67,7 @@ class Textures:
     specular: Float32Array | None = None
 
     def put_on(self, mesh: SurfaceMesh, mask: Bools) -> SurfaceMesh:
-        """Return a mesh with these textures, which are known in the mask (H, W)."""
+        """Return a mesh with these textures, which are known inside the mask (H, W)."""
         given = {name: picture for name, picture in vars(self).items() if picture is not None}
         return replace(mesh, **{name: fill_outside(given[name], mask) for name in given})
 
@@ -82,20 +82,20 @@ def surface_mesh(
 ) -> SurfaceMesh:
     """Return the mesh of a height or depth map, with a vertex for each pixel of the mask.
 
-    Vertices are in the order of the pixels, row by row. Four pixels of the mask in a square make
-    two triangles, split along the diagonal whose ends differ less in height. Three make one
-    triangle. Raises UsageError if the largest step is negative.
+    Vertices are in the order of the pixels, row by row. Four pixels of the mask in a square form
+    two triangles, split along the diagonal with the smaller difference in height. Three pixels form
+    one triangle. Raises UsageError if the largest step is negative.
 
     Args:
         depth: (H, W), finite in the mask (H, W): heights, or positive depths with a camera matrix,
-            as integrate_normals returns them.
+            as returned by integrate_normals.
         mask: (H, W), True on the object.
-        camera_matrix: (3, 3), the one that integrate_normals had, or None.
-        normal_map: (H, W, 3), unit in the mask: the normals of the vertices. None to compute them
+        camera_matrix: (3, 3), the same as for integrate_normals, or None.
+        normal_map: (H, W, 3), unit in the mask: the normals of the vertices. None computes them
             from the triangles.
-        largest_step: leaves out triangles whose corners differ by more than this in height, in
-            pixels (for a pinhole camera, in pixels at the depth of the triangle). They are the
-            walls where the surface is torn. None keeps all triangles.
+        largest_step: triangles whose corners differ in height by more than this are left out,
+            because they are the walls where the surface is torn. In pixels; for a pinhole camera,
+            in pixels at the depth of the triangle. None keeps all triangles.
     """
     if largest_step is not None and not largest_step >= 0:
         raise UsageError(f"the largest step is {largest_step:g}, expected a number of at least 0")
@@ -116,9 +116,9 @@ def surface_mesh(
 
 
 def check_triangles(mask: Bools, path: Path) -> None:
-    """Raise InputError about `path` if the mesh of a mask (H, W) has no triangle.
+    """Raise InputError for `path` if the mesh of a mask (H, W) has no triangles.
 
-    No square of four pixels then has three of the mask.
+    A triangle needs three pixels of the mask in a square of four.
     """
     count = mask.astype(np.uint8)
     squares = count[:-1, :-1] + count[1:, :-1] + count[:-1, 1:] + count[1:, 1:]
@@ -129,16 +129,17 @@ def check_triangles(mask: Bools, path: Path) -> None:
 def no_triangles(
     path: Path | None = None, *, instead: str = "leave glb out of the formats"
 ) -> InputError:
-    """Return the error of a mesh that has none."""
+    """Return the error for a mesh without triangles."""
     return InputError(
-        "the mesh has no triangles: nowhere do three pixels of the object form a corner",
+        "the mesh has no triangles, because no three pixels of the object form a corner",
         path=path,
         hint=f"Enlarge the mask, or {instead}",
     )
 
 
 def vertex_normals(vertices: Floats, triangles: Integers) -> Float64Array:
-    """Return the unit normals (V, 3) of vertices: means over their triangles, weighted by area.
+    """Return the unit normals (V, 3) of vertices, averaged over their triangles with weights by
+    area.
 
     A vertex without triangles has the normal (0, 0, 1).
     """
@@ -156,10 +157,11 @@ def texture_coordinates(points: Floats, shape: tuple[int, ...]) -> Float32Array:
 
 
 def fill_outside(texture: NDArray[Any], known: Bools) -> NDArray[Any]:
-    """Fill the unknown pixels of a texture (H, W) or (H, W, 3) with their nearest known ones.
+    """Return a texture (H, W) or (H, W, 3) whose unknown pixels have the value of the nearest known
+    pixel.
 
-    Viewers interpolate between pixels and reduce textures, which would bring in the background at
-    the border.
+    Viewers interpolate between pixels and reduce textures, so the background would appear at the
+    border.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -172,7 +174,7 @@ def fill_outside(texture: NDArray[Any], known: Bools) -> NDArray[Any]:
 def _triangles(heights: Float64Array, mask: Bools) -> NDArray[np.int32]:
     number = np.full(mask.shape, -1, np.int32)
     number[mask] = np.arange(len(heights))
-    # The corners of each square, counter-clockwise from the top left (y is up).
+    # The corners of each square, counter-clockwise from the top left (y up).
     corners = (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:])
     squares = np.stack(corners, axis=-1).reshape(-1, 4)
     inside = squares >= 0
@@ -186,11 +188,11 @@ def _triangles(heights: Float64Array, mask: Bools) -> NDArray[np.int32]:
     return np.concatenate(parts)
 
 
-# pixels above which a map's triangles are too many, so the triangles of its blocks are decimated
+# Number of pixels above which the triangles of blocks are decimated, because all are too many
 LARGE_MAP = 500_000
 # A border is smoothed over about this many vertices on either side.
 _OUTLINE_ROUNDS = 4
-# barycentric coordinate down to which a pixel is inside, so that none is lost between triangles
+# Tolerance of barycentric coordinates, so that no pixel is lost between triangles
 _OUTSIDE = 1e-6
 
 
@@ -205,9 +207,9 @@ def decimated_mesh(
 ) -> SurfaceMesh:
     """Return a mesh of about `n_triangles` triangles, with a texture of the normals.
 
-    The outline is smoothed, and edges are collapsed where this moves the surface least (Garland and
-    Heckbert, Surface simplification using quadric error metrics, SIGGRAPH 1997). A mesh that has no
-    more triangles is returned as it is.
+    The outline is smoothed, and edges are collapsed where this changes the surface least (Garland
+    and Heckbert, Surface simplification using quadric error metrics, SIGGRAPH 1997). A mesh that
+    does not have more triangles is returned as it is.
 
     Args:
         depth, mask, camera_matrix, largest_step: see surface_mesh.
@@ -218,9 +220,9 @@ def decimated_mesh(
         UsageError: fast-simplification is not installed, or the largest step is negative.
         InputError: no triangle is left.
     """
-    # Collapsing all edges of a large map takes a lot of memory. If far fewer triangles than pixels
-    # are requested, a mesh of blocks with at least four times the requested number has the same
-    # shape, and the normal texture keeps the detail.
+    # Collapsing all edges of a large map takes much memory. If far fewer triangles than pixels are
+    # requested, a mesh of blocks with at least four times the requested number has the same shape,
+    # and the normal texture preserves the detail.
     mesh, n_pixels = None, np.count_nonzero(mask)
     step = int((2 * n_pixels / (4 * n_triangles)) ** 0.5)
     if step > 1 and n_pixels > LARGE_MAP:
@@ -233,14 +235,15 @@ def decimated_mesh(
         return mesh
     mesh = with_smooth_outline(mesh)
     simplify = import_extra("fast_simplification", "mesh").simplify
-    # The thresholds of the library are lengths: give it pixels.
+    # The library has thresholds in the unit of the vertices, which are suitable for pixels.
     pixel = 1 if camera_matrix is None else 1 / focal_length(camera_matrix)
     vertices, triangles = simplify(
         mesh.vertices.astype(np.float64) / pixel, mesh.triangles, target_count=n_triangles
     )
     if not len(triangles):
         raise InputError(
-            f"no mesh of {n_triangles} triangles is left", hint="Ask for more with --decimate"
+            f"no mesh of {n_triangles} triangles is left",
+            hint="Request more triangles with --decimate",
         )
     vertices = vertices * pixel
     normals = vertex_normals(vertices, triangles)
@@ -289,7 +292,7 @@ def _mesh_of_blocks(
     of_blocks = np.zeros((*blocks.mask.shape, 4))
     pixels = np.concatenate((depth[mask][:, None], normal_map[mask]), axis=1)
     of_blocks[blocks.mask] = blocks.average(pixels, mask)
-    # Without a camera, a step is measured in blocks, like a pixel.
+    # Without a camera matrix, lengths are measured in blocks instead of pixels.
     scale = step if camera_matrix is None else 1
     mesh = surface_mesh(
         of_blocks[..., 0] / scale,
@@ -310,9 +313,9 @@ def _tangents(
 ) -> Float64Array:
     """Return the unit tangents (V, 3), which follow the rows of the image along the surface.
 
-    They are perpendicular to the normals. A row of the image shows the plane that contains the
-    viewing rays of the row. This is how viewers compute tangents themselves (MikkTSpace): the
-    derivative of the position along u.
+    They are perpendicular to the normals, and in the plane that contains the viewing rays of a row.
+    Viewers compute tangents in the same way, as the derivative of the position along u
+    (MikkTSpace).
     """
     along = np.array((1.0, 0.0, 0.0)) if camera_matrix is None else ray_basis(camera_matrix)[0]
     rays = np.array((0.0, 0.0, -1.0)) if camera_matrix is None else vertices
@@ -330,17 +333,17 @@ def _normal_texture(
 ) -> Picture:
     """Return the normal texture (H, W, 3) of a mesh.
 
-    Pixels outside the mesh have the value of the nearest inside. `points` (V, 2) are the columns
-    and rows of the vertices in the image, `triangles` (T, 3) their numbers, `normals` and
-    `tangents` (V, 3) unit. The normal map (H, W, 3) is zero off the object.
+    Pixels outside the mesh have the value of the nearest pixel inside. `points` (V, 2) are the
+    columns and rows of the vertices in the image, `triangles` (T, 3) their indices, and `normals`
+    and `tangents` (V, 3) unit vectors. The normal map (H, W, 3) is zero outside the object.
     """
     texture = np.full(normal_map.shape, (128, 128, 255), np.uint8)
     known = np.zeros(normal_map.shape[:2], np.bool_)
     on_object = np.asarray(normal_map.any(axis=2))
     for number, weights, rows, columns in _covered_pixels(points, triangles, known.shape):
-        seen = on_object[rows, columns]
-        corners, weights = triangles[number[seen]], weights[seen]
-        rows, columns = rows[seen], columns[seen]
+        known_here = on_object[rows, columns]
+        corners, weights = triangles[number[known_here]], weights[known_here]
+        rows, columns = rows[known_here], columns[known_here]
         frames = (unit(np.einsum("qc,qcx->qx", weights, of[corners])) for of in (normals, tangents))
         texels = _in_frame(normal_map[rows, columns].astype(np.float64), *frames)
         texture[rows, columns] = np.rint((texels + 1) / 2 * 255)
@@ -353,7 +356,7 @@ def _in_frame(
 ) -> Float64Array:
     """Return the unit coordinates (Q, 3) of normals in the frames T, B = N x T, N.
 
-    T need not be perpendicular to N.
+    T may deviate from being perpendicular to N.
     """
     bitangents = np.cross(normals, tangents)
     axes = (tangents, bitangents, normals)
@@ -370,16 +373,16 @@ def _covered_pixels(
 ) -> Iterator[tuple[Indices, Float64Array, Indices, Indices]]:
     """Yield the pixels whose centres are in triangles.
 
-    These are the triangle (Q,), barycentric coordinates (Q, 3), row and column of each.
+    Each item contains the triangles (Q,), the barycentric coordinates (Q, 3), and the rows and
+    columns.
     """
     for start in range(0, len(triangles), 50_000):
         numbers = np.arange(start, min(start + 50_000, len(triangles)))
         corners = points[triangles[numbers]]
         forms = _barycentric_forms(corners)
-        seen = np.isfinite(forms).all(axis=(1, 2))
-        numbers, corners, forms = numbers[seen], corners[seen], forms[seen]
-        # The rows of each triangle, and in each row the columns in which all three coordinates are
-        # positive.
+        usable = np.isfinite(forms).all(axis=(1, 2))
+        numbers, corners, forms = numbers[usable], corners[usable], forms[usable]
+        # Find the rows of each triangle, and in each row the columns with positive coordinates.
         first = np.ceil(corners[..., 1].min(axis=1) - _OUTSIDE).clip(0, shape[0])
         last = np.floor(corners[..., 1].max(axis=1) + _OUTSIDE).clip(-1, shape[0] - 1)
         which, rows = _ranges(first, last)
@@ -398,7 +401,7 @@ def _covered_pixels(
 
 
 def _barycentric_forms(corners: Float64Array) -> Float64Array:
-    """Return forms (T, 3, 3) that map (column, row, 1) to the barycentric coordinates."""
+    """Return linear forms (T, 3, 3) from (column, row, 1) to barycentric coordinates."""
     following, last = np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)
     edge = last - following
     normal = np.stack((-edge[..., 1], edge[..., 0]), axis=-1)
@@ -409,7 +412,9 @@ def _barycentric_forms(corners: Float64Array) -> Float64Array:
 
 
 def _ranges(first: Float64Array, last: Float64Array) -> tuple[Indices, Indices]:
-    """Return the integers from each first to its last, and before them the index of their range."""
+    """Return the index of the range for each integer in ranges (first to last), and these
+    integers.
+    """
     lengths = np.maximum(last - first + 1, 0).astype(np.intp)
     which = np.repeat(np.arange(len(lengths)), lengths)
     within = np.arange(len(which)) - np.repeat(np.cumsum(lengths) - lengths, lengths)

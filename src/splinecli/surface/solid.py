@@ -1,4 +1,4 @@
-"""Closed meshes: a surface with a flat back, and with walls along its border, for printing."""
+"""Closed meshes for printing: a surface with walls along its border and a flat back."""
 
 from dataclasses import replace
 from typing import Any
@@ -13,14 +13,14 @@ from splinecli.surface.mesh import SurfaceMesh, no_triangles
 def close_mesh(mesh: SurfaceMesh, thickness: float, *, perspective: bool) -> SurfaceMesh:
     """Return the solid between a surface and a plane behind it, perpendicular to the viewing axis.
 
-    The walls follow the viewing rays of the border: they are parallel to the axis for an
-    orthographic camera and spread from the camera for a perspective one. Every edge of the solid
+    The walls follow the viewing rays of the border, so they are parallel to the axis for an
+    orthographic camera, and diverge from the camera for a perspective one. Every edge of the solid
     belongs to exactly two triangles, and the normals of the triangles point outwards. Where two
-    parts of the surface touch at a single vertex, triangles of one are left out, because the edge
-    of the walls there would belong to four.
+    parts of the surface touch only at a vertex, triangles of one part are left out, because an edge
+    of the walls would belong to four triangles.
 
     Args:
-        mesh: an open surface, its triangles counter-clockwise as viewed by the camera.
+        mesh: an open surface with triangles counter-clockwise in the camera's view.
         thickness: the distance from the lowest vertex to the plane, positive.
         perspective: whether the camera is at the origin, instead of at infinity.
 
@@ -62,12 +62,12 @@ def _edges(triangles: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def _keys(edges: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Return one number for each directed edge (E, 2)."""
+    """Return one integer for each directed edge (E, 2)."""
     return np.asarray(edges @ np.array((1 << 32, 1)), np.int64)
 
 
 def _opposite(triangles: NDArray[np.int32]) -> Indices:
-    """Return the number of each directed edge's reverse (3 T,), -1 without one."""
+    """Return the index of each directed edge's reverse (3 T,), or -1 without one."""
     edges = _edges(triangles)
     keys, wanted = _keys(edges), _keys(edges[:, ::-1])
     order = np.argsort(keys)
@@ -76,11 +76,11 @@ def _opposite(triangles: NDArray[np.int32]) -> Indices:
 
 
 def _manifold(triangles: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the triangles without those that touch the others at a vertex only.
+    """Return the triangles without those that touch the others only at a vertex.
 
-    The triangles around each vertex then form one fan, whose border is closed or passes the vertex
-    once. Of triangles that pass an edge in the same direction, which decimation may make, the first
-    is kept.
+    The triangles around each vertex then form a single fan, whose border is closed or contains the
+    vertex once. If several triangles have an edge in the same direction, which decimation may
+    cause, the first is kept.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

@@ -1,7 +1,7 @@
 """The files of a surface: meshes (glTF, PLY, OBJ, STL, 3MF) and depth maps (NPY, TIFF, EXR, PNG).
 
-The command line needs the names in this file, so everything heavier than NumPy is imported in
-functions.
+The command line needs the names in this file, so every import heavier than NumPy is inside a
+function.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 
 DEFAULT_FORMATS = ("glb", "ply", "npy", "tiff", "png")
-USUAL_SPECULAR = 0.5  # of glTF: a reflectance of 4 %
-GRAY = 204  # colour of a mesh without a texture, of 255
+USUAL_SPECULAR = 0.5  # glTF's default, a reflectance of 4 %
+GRAY = 204  # colour of a mesh without a texture, from 0 to 255
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class Surface:
 
     depth: Floats  # (H, W), NaN outside the object
     mesh: SurfaceMesh  # the mesh of the same surface
-    unit: str  # the name of the unit of both
-    millimetres: float  # the length of this unit in a file of glTF
-    # (H, W, 3), the normals of a surface that was levelled
+    unit: str  # the name of their unit
+    millimetres: float  # the length of this unit in glTF and 3MF files
+    # (H, W, 3), the normals of a levelled surface
     level_normals: Float32Array | None = None
 
 
@@ -49,9 +49,8 @@ def encode_surface(
 ) -> Iterator[tuple[str, Content]]:
     """Yield the name and the content (see NewFiles.write) of each file of a surface.
 
-    The formats are keys of SURFACE_FILES.
-
-    Raises InputError if a mesh without triangles cannot be written as GLB.
+    The formats are keys of SURFACE_FILES. Raises InputError if a mesh without triangles would be
+    written as GLB.
     """
     for form in formats:
         if form == "obj":
@@ -61,9 +60,8 @@ def encode_surface(
 
 
 def _encode_glb(surface: Surface) -> bytes:
-    """Encode binary glTF 2.0 in metres, with textures that are lit from both sides.
-
-    Without a texture of the gloss, the surface is matte.
+    """Return binary glTF 2.0 in metres, with two-sided textures. Without a gloss, the surface is
+    matte.
     """
     import trimesh
     from PIL import Image
@@ -79,7 +77,7 @@ def _encode_glb(surface: Surface) -> bytes:
     def add_rest(buffers: Any, tree: Any) -> None:
         """Add the parts of a glTF file that trimesh cannot write.
 
-        Without the tangents, viewers derive their own tangents in different ways.
+        Tangents are included because viewers would compute them in different ways.
         """
         if mesh.specular is not None:
             _add_specular(buffers, tree, mesh.specular)
@@ -122,7 +120,7 @@ def _encode_glb(surface: Surface) -> bytes:
 
 
 def _add_specular(buffers: Any, tree: Any, specular: Float32Array) -> None:
-    """Add KHR_materials_specular, the reflectance (H, W) relative to the usual one.
+    """Add KHR_materials_specular, the reflectance (H, W) relative to the default.
 
     The glTF file has one material.
     """
@@ -150,10 +148,7 @@ def _encode_texture(picture: Picture) -> bytes:
 
 
 def _encode_ply(surface: Surface) -> bytes:
-    """Encode binary PLY, with the normals and colours of the vertices.
-
-    A comment has the unit's name.
-    """
+    """Return binary PLY with the normals and colours of the vertices, and the unit in a comment."""
     import trimesh
 
     mesh = surface.mesh
@@ -165,11 +160,11 @@ def _encode_ply(surface: Surface) -> bytes:
 
 
 def _encode_obj(surface: Surface) -> dict[str, bytes]:
-    """Encode OBJ with normals, texture coordinates and, with colours, textures.
+    """Return OBJ files with normals, texture coordinates and, with colours, textures.
 
-    A comment has the unit's name. With a gloss, the material has the maps of the extension for
-    physically-based rendering, and Phong's highlight of the same height and about the same width
-    for programs that do not read these maps.
+    A comment contains the unit. With a gloss, the material has the maps of the extension for
+    physically-based rendering. For programs that do not read these maps, it also has a Phong
+    highlight of the same height and about the same width.
     """
     import trimesh
     from PIL import Image
@@ -182,7 +177,7 @@ def _encode_obj(surface: Surface) -> dict[str, bytes]:
         roughness, metalness = np.moveaxis(mesh.gloss[..., 1:] / 255, 2, 0)
         specular = USUAL_SPECULAR if mesh.specular is None else mesh.specular
         base = decode_transfer(mesh.texture.mean(axis=2) / 255, None)
-        square = max(float(roughness.mean()) ** 4, 1e-3)  # of the width of the facets' slopes
+        square = max(float(roughness.mean()) ** 4, 1e-3)  # squared width of the facets' slopes
         reflectance = float((0.08 * specular * (1 - metalness) + base * metalness).mean()) / (
             4 * square
         )
@@ -233,7 +228,7 @@ xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">
 
 
 def _encode_3mf(surface: Surface) -> bytes:
-    """Encode 3MF (3D Manufacturing Format, core specification 1.3) in millimetres."""
+    """Return 3MF (3D Manufacturing Format, core specification 1.3) in millimetres."""
     lines = {
         "vertices": _lines(
             '<vertex x="%.7g" y="%.7g" z="%.7g"/>\n', surface.mesh.vertices * surface.millimetres
@@ -248,7 +243,7 @@ def _encode_3mf(surface: Surface) -> bytes:
 
 
 def _lines(line: str, rows: Floats | Integers) -> str:
-    """Return the text of all rows (N, 3), with few numbers as objects at once."""
+    """Return the text of all rows (N, 3), converting few numbers to objects at a time."""
     parts = np.array_split(rows, len(rows) // 100_000 + 1)
     return "".join(line * len(part) % tuple(part.ravel().tolist()) for part in parts)
 
@@ -272,9 +267,9 @@ def _encode_exr(surface: Surface) -> bytes:
 
 
 def _encode_png(surface: Surface) -> bytes:
-    """Encode the depth map as 16-bit gray: 0 outside the object, then 1 to 65535 by depth.
+    """Return the depth map as 16-bit gray: 0 outside the object, then 1 to 65535 by depth.
 
-    The text `depth` of the PNG file has these values and their unit.
+    The text `depth` in the PNG file contains these values and their unit.
     """
     from PIL import Image, PngImagePlugin
 
@@ -290,7 +285,7 @@ def _encode_png(surface: Surface) -> bytes:
 _ENCODERS: dict[str, Callable[[Surface], Content]] = {
     "glb": _encode_glb,
     "ply": _encode_ply,
-    # binary, with positions alone
+    # binary, with positions only
     "stl": lambda surface: _trimesh(surface.mesh).export(file_type="stl"),
     "3mf": _encode_3mf,
     "npy": lambda surface: surface.depth.astype("f4"),
@@ -320,16 +315,16 @@ def _textured(mesh: SurfaceMesh, material: Any) -> Any:
 
 
 def encode_exr(pixels: Floats, attributes: Mapping[str, str]) -> bytes:
-    """Return the EXR file of a map of float16 or float32, with texts by name in its header.
+    """Return an EXR file of a float16 or float32 map, with texts by name in its header.
 
-    Compression (ZIP) is lossless. The map is (H, W, 3), the channels R, G and B, or (H, W), the
-    channel Y. Blender reads these names. Raises UsageError if OpenEXR is not installed, or
+    Compression (ZIP) is lossless. A map (H, W, 3) has the channels R, G and B, and a map (H, W) the
+    channel Y, because Blender reads these names. Raises UsageError if OpenEXR is not installed, or
     OutputError if the folder for temporary files cannot be written.
     """
     library = import_extra("OpenEXR", "exr")
     header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage, **attributes}
     channels = {"Y" if pixels.ndim == 2 else "RGB": np.ascontiguousarray(pixels)}
-    # The library writes files only.
+    # The library can only write files.
     with TemporaryDirectory() as folder:
         path = Path(folder) / "map.exr"
         try:
@@ -340,6 +335,6 @@ def encode_exr(pixels: Floats, attributes: Mapping[str, str]) -> bytes:
 
 
 def check_exr(formats: Sequence[str]) -> None:
-    """Raise UsageError if EXR files are to be written and the library is not installed."""
+    """Raise UsageError if EXR files are requested and the library is not installed."""
     if "exr" in formats:
         import_extra("OpenEXR", "exr")

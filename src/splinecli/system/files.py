@@ -1,4 +1,4 @@
-"""Files: queries about paths, and output files that appear complete or not at all."""
+"""Files: queries about paths, and output files that appear either complete or not at all."""
 
 import errno
 import hashlib
@@ -18,27 +18,27 @@ from msgspec import ValidationError, convert
 
 from splinecli.errors import InputError, OutputError
 
-UNFINISHED = ".splinecli-unfinished"  # the ending of hidden files that are being written
-_MOST_JSON = 1 << 24  # bytes of a file
+UNFINISHED = ".splinecli-unfinished"  # suffix of hidden files that are being written
+_MOST_JSON = 1 << 24  # largest size of a JSON file in bytes
 
 
 def free_name(name: str, is_taken: Callable[[str], bool], mark: str = "-") -> str:
-    """Return the name, or the name with a mark and the lowest number from 2 that is not taken."""
+    """Return the name, with a mark and a number from 2 if it is taken."""
     numbered = (f"{name}{mark}{number}" for number in itertools.count(2))
     return next(each for each in itertools.chain([name], numbered) if not is_taken(each))
 
 
 def file_sha256(path: Path) -> str:
-    """Return the SHA-256 of a file's content in hexadecimal digits."""
+    """Return the SHA-256 of a file's content as hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def equal_files(paths: Sequence[Path]) -> list[tuple[int, int]]:
-    """Return the places in `paths` of the first file with the same content, and of each file that
-    has an earlier one. Raises OSError.
+    """Return pairs of indices in `paths` of files with the same content: the first, and each later
+    one.
 
-    Only files of equal size are opened.
+    Only files of equal size are opened. Raises OSError.
     """
     sizes = [path.stat().st_size for path in paths]
     usual = Counter(sizes)
@@ -55,13 +55,14 @@ def equal_files(paths: Sequence[Path]) -> list[tuple[int, int]]:
 
 
 def expanded(path: str) -> Path:
-    """Return the path with ~ replaced by the home folder, unless there is none."""
+    """Return the path with ~ replaced by the home folder, if there is one."""
     return Path(os.path.expanduser(path))  # noqa: PTH111 - Path.expanduser raises for an unknown user
 
 
 def utf8_name(path: Path, file: IO[bytes]) -> str:
-    """Return the path of an open file for a C library; another name if it is not UTF-8, which some
-    crash on.
+    """Return a path of an open file for a C library.
+
+    If the name is not UTF-8, on which some libraries crash, another path of the file is returned.
     """
     name = str(path.absolute())
     try:
@@ -72,15 +73,17 @@ def utf8_name(path: Path, file: IO[bytes]) -> str:
 
 
 def create_hidden(folder: Path) -> IO[bytes]:
-    """Return a new hidden file of a random name in the folder, open for writing. Raises OSError."""
-    # Mode x neither opens an existing file nor follows a link.
+    """Return a new hidden file with a random name in the folder, open for writing. Raises
+    OSError.
+    """
+    # With mode x, neither an existing file is opened nor a link followed.
     return (folder / f".{secrets.token_hex(8)}{UNFINISHED}").open("xb")
 
 
 @contextmanager
 def made_folder(folder: Path) -> Iterator[list[Path]]:
-    """Make a folder, and yield those that were made: it and its parents. At the end, empty ones are
-    removed again.
+    """Create a folder, and yield the created folders, including parents. Empty ones are removed at
+    the end.
     """
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
@@ -94,11 +97,11 @@ def made_folder(folder: Path) -> Iterator[list[Path]]:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """Yield a new file that replaces `path` after the block, so that it appears complete or not at
-    all.
+    """Yield a new file that replaces `path` after the block, so that it is complete or does not
+    appear.
 
-    It is written in the same folder and renamed. The rename replaces a link instead of following
-    it. Folders are created as needed. Raises OutputError.
+    It is written to the same folder and renamed, which replaces a link instead of following it.
+    Folders are created as needed. Raises OutputError.
     """
     temporary: Path | None = None
     with refusals_as_output_errors(path), made_folder(path.parent) as made:
@@ -115,14 +118,14 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file as `replacing` does. Raises OutputError."""
+    """Write a file in the same way as `replacing`. Raises OutputError."""
     with replacing(path) as file:
         file.write(content)
 
 
 def sync(path: Path) -> None:
-    """Wait until the content of a file, or the names in a folder, are on the disk.
-    Raises OSError.
+    """Wait until the content of a file, or the names in a folder, are on the disk. Raises
+    OSError.
     """
     windows = os.name == "nt"
     if windows and path.is_dir():  # Windows cannot open folders
@@ -138,9 +141,7 @@ def sync(path: Path) -> None:
 
 
 def sync_names(folder: Path, *made: Path) -> None:
-    """Wait until the names in a folder and in newly made folders are on the disk.
-    Raises OSError.
-    """
+    """Wait until the names in a folder and in new folders are on the disk. Raises OSError."""
     for place in dict.fromkeys((folder, *(new.parent for new in made))):
         sync(place)
 
@@ -149,14 +150,14 @@ Value = TypeVar("Value")
 
 
 def parse_json(text: str | bytes, kind: type[Value] | Any = Any) -> Value | Any:
-    """Return the value of a JSON text, such as a record of this kind.
+    """Return the value of a JSON text, optionally as a record of this kind.
 
-    Raises ValueError, including if it is deeply nested, a number is not finite or no float can hold
-    it, or the value does not fit the kind, with its place.
+    Raises ValueError, also if the text is deeply nested, if a number is not finite or exceeds the
+    range of floats, or if the value does not match the kind.
     """
 
     def whole_number(digits: str) -> int:
-        if len(digits) > 300:  # a float holds any of so many
+        if len(digits) > 300:  # shorter numbers are within the range of floats
             raise ValueError(f"a number has {len(digits)} digits")
         return int(digits)
 
@@ -177,15 +178,14 @@ def parse_json(text: str | bytes, kind: type[Value] | Any = Any) -> Value | Any:
 
 
 def is_special(path: Path) -> bool:
-    """Return whether the path is something other than a file: a folder, a pipe or a device, which
-    might never end.
-    """
+    """Return whether the path exists but is not a file, such as a device, which might never end."""
     return path.exists() and not path.is_file()
 
 
 def read_json(path: Path, kind: type[Value] | Any = Any) -> Value | Any:
-    """Return the value of a JSON file. Raises OSError, or ValueError as parse_json does and if it
-    is not a file.
+    """Return the value of a JSON file.
+
+    Raises OSError, or ValueError as in parse_json and if it is not a file.
     """
     if is_special(path):
         raise ValueError("it is not a file")
@@ -195,7 +195,7 @@ def read_json(path: Path, kind: type[Value] | Any = Any) -> Value | Any:
 
 
 class NoRoomError(OutputError):
-    """The disk is full or read-only. Other folders would fail, too, so a batch ends."""
+    """The disk is full or read-only. A batch ends, because other folders would fail, too."""
 
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
@@ -203,11 +203,11 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 @contextmanager
 def refusals_as_output_errors(path: Path) -> Iterator[None]:
-    """Convert an OSError inside the context to an OutputError that names the path."""
+    """Convert an OSError inside the context to an OutputError with the path."""
     try:
         yield
     except OSError as error:
-        # NumPy states only how much was written.
+        # NumPy's errors only state how much was written.
         reason = error.strerror or f"{error}; the disk may be full"
         kind = NoRoomError if error.errno in (None, *_NO_ROOM) else OutputError
         raise kind(
@@ -216,10 +216,9 @@ def refusals_as_output_errors(path: Path) -> Iterator[None]:
 
 
 def as_splinecli_error(error: OSError, path: Path | None = None) -> InputError | NoRoomError:
-    """Return splinecli's error for an OSError outside refusals_as_output_errors, usually for a file
-    that cannot be read.
+    """Return splinecli's error for an OSError that usually means that a file cannot be read.
 
-    `path` is named if the error does not name a file.
+    `path` is used if the error does not name a file.
     """
     if error.errno in _NO_ROOM:
         return NoRoomError(f"cannot be written ({error.strerror})", error.filename or path)
@@ -227,7 +226,9 @@ def as_splinecli_error(error: OSError, path: Path | None = None) -> InputError |
 
 
 def check_writable(folder: Path) -> None:
-    """Raise OutputError unless a folder exists or can be made, and files can be written into it."""
+    """Raise OutputError unless a folder exists or can be created, and files can be written to
+    it.
+    """
     place = folder
     try:
         while not place.exists():
@@ -242,8 +243,8 @@ def check_writable(folder: Path) -> None:
 
 
 def check_free(folder: Path, names: Iterable[str], *, overwrite: bool) -> None:
-    """Raise OutputError as check_writable does, or if a folder has one of the named files and not
-    `overwrite`.
+    """Raise OutputError as check_writable does, or if a file exists already and `overwrite` is
+    false.
     """
     check_writable(folder)
     for name in () if overwrite else names:
@@ -256,19 +257,21 @@ def check_free(folder: Path, names: Iterable[str], *, overwrite: bool) -> None:
 
 
 def write_text(path: Path, content: str) -> None:
-    """Write UTF-8 text as write_bytes does. Characters of file names that are not valid text become
-    escapes.
+    """Write UTF-8 text in the same way as write_bytes.
+
+    Characters of file names that are not valid text are escaped.
     """
     write_bytes(path, content.encode(errors="backslashreplace"))
 
 
 _KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
-StrPath = str | os.PathLike[str]  # a path in any form that the standard library takes
+StrPath = str | os.PathLike[str]  # a path in any form accepted by the standard library
 
 
 def find_mode(path: Path) -> int | None:
-    """Return the mode (see stat) of the path, following links; None if it does not exist. Raises
-    InputError.
+    """Return the mode of a path (see stat), following links; None if it does not exist.
+
+    Raises InputError.
     """
     try:
         return path.stat().st_mode
@@ -281,10 +284,9 @@ def find_mode(path: Path) -> int | None:
 
 
 def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
-    """Raise InputError unless there is a file. Anything else, such as a device, might never end or
-    never begin.
+    """Raise InputError unless the path is a file. A device, for example, might never end.
 
-    With `pipe`, the shell's process substitution `<(...)` is accepted as well, see is_substitution.
+    With `pipe`, process substitution of the shell, `<(...)`, is also accepted; see is_substitution.
     """
     mode = find_mode(path)
     if mode is None:
@@ -296,20 +298,19 @@ def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
 
 
 @contextmanager
-def reading(path: Path, what: str = "file") -> Iterator[None]:
-    """Convert a system error while a file is read to an InputError that names it."""
+def reading(path: Path, kind: str = "file") -> Iterator[None]:
+    """Convert a system error while a file is read to an InputError with its path."""
     try:
         yield
     except OSError as error:
-        raise InputError(f"the {what} cannot be read ({error.strerror})", path) from None
+        raise InputError(f"the {kind} cannot be read ({error.strerror})", path) from None
 
 
 def is_found_file(path: Path) -> bool:
-    """Return whether an entry of a folder, with the name of a file that is read, is a file; False
-    for a folder.
+    """Return whether an entry of a folder is a file, and False for a folder.
 
-    Raises InputError for anything else, such as a pipe or a broken link. Skipping it would hide the
-    problem.
+    Raises InputError for anything else, such as a pipe or a broken link, because skipping it would
+    hide the problem.
     """
     if is_folder(path):
         return False
@@ -318,8 +319,8 @@ def is_found_file(path: Path) -> bool:
 
 
 def is_substitution(path: Path) -> bool:
-    """Return whether the path is a pipe that the shell has opened for this process: `<(...)`, or
-    standard input.
+    """Return whether the path is a pipe opened by the shell: process substitution or standard
+    input.
     """
     try:
         opened = str(path).startswith(("/dev/fd/", "/proc/self/fd/", "/dev/stdin"))
@@ -329,12 +330,12 @@ def is_substitution(path: Path) -> bool:
 
 
 def is_folder(path: Path) -> bool:
-    """Return whether there is a folder; False if the system refuses to answer."""
+    """Return whether a folder exists; False if the system does not answer."""
     return os.path.isdir(path)  # noqa: PTH112 - Path.is_dir raises for a name that is too long
 
 
 def resolve(path: Path) -> Path:
-    """Return the path without links and "..". Raises InputError if the system refuses to answer."""
+    """Return the path without links and "..". Raises InputError if the system cannot resolve it."""
     try:
         return path.resolve()
     except RuntimeError:  # for a loop of links, before Python 3.13

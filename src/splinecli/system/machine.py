@@ -20,7 +20,7 @@ from splinecli.errors import SplinecliError, UsageError
 if TYPE_CHECKING:
     import torch
 
-# The message for each extra
+# Messages by extra
 _PROBLEMS = {
     "cluster": "--workers above 1 and --cluster need the package distributed,"
     " which is not installed",
@@ -41,10 +41,11 @@ def import_extra(
     path: Path | None = None,
     otherwise: str | None = None,
 ) -> ModuleType:
-    """Import a module of an extra, a key of _PROBLEMS, when it is used for the first time.
+    """Return a module of an extra (a key of _PROBLEMS), imported when it is first used.
 
-    Raises UsageError or `error` if the module is not installed. The message names the command that
-    installs it, the file at `path` that cannot be read without it, and `otherwise`, an alternative.
+    Raises UsageError or `error` if the module is not installed. The message contains the command
+    that installs it, the file at `path` that cannot be read without it, and `otherwise`, an
+    alternative.
     """
     try:
         return importlib.import_module(module)
@@ -56,20 +57,19 @@ def import_extra(
 
 
 LARGEST_IMAGE = 400_000_000  # pixels of the largest image that is read
-# Lines "0::/group" (version 2) or "N:controllers:/group" (version 1)
+# Contains lines "0::/group" (version 2) or "N:controllers:/group" (version 1)
 GROUPS = Path("/proc/self/cgroup")
 MOUNT = Path("/sys/fs/cgroup")
-_GROUP_FILES = (  # the limit, the use, and the file cache within it
+_GROUP_FILES = (  # the limit, the usage, and the file cache, which is part of the usage
     ("memory.max", "memory.current", "inactive_file"),  # version 2
     ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),  # version 1
 )
 
 
 def available_memory() -> float:
-    """Return the number of bytes that this process may still allocate; infinity if the system does
-    not report it.
+    """Return the number of bytes that this process may still allocate; infinity if it is unknown.
 
-    It is the smallest of the machine's free memory, the limits of the process's control groups, and
+    It is the minimum of the machine's free memory, the limits of the process's control groups, and
     the limit on its address space (ulimit -v).
     """
     in_groups = map(_left_in_group, own_groups("memory"))
@@ -77,8 +77,10 @@ def available_memory() -> float:
 
 
 def own_groups(controller: str) -> Iterator[Path]:
-    """Yield the folders of this process's control groups that limit `controller`, cpu or memory,
-    and of those above.
+    """Yield the folders of this process's control groups, and of their parents, that limit
+    `controller`.
+
+    The controller is cpu or memory.
     """
     try:
         lines = GROUPS.read_text("utf-8").splitlines()
@@ -92,8 +94,8 @@ def own_groups(controller: str) -> Iterator[Path]:
         if not top.is_dir():
             top = MOUNT / controller
         folder = top / group.lstrip("/")
-        # Inside a container the path may be the host's, which does not exist here. The top always
-        # exists.
+        # In a container, the path may be that of the host, which does not exist here. The top
+        # always exists.
         for place in (folder, *folder.parents):
             yield place
             if place == top:
@@ -101,24 +103,26 @@ def own_groups(controller: str) -> Iterator[Path]:
 
 
 def check_address_space() -> None:
-    """Raise SplinecliError if the limit on the address space (ulimit -v) is too low to load the
-    numerical libraries.
+    """Raise SplinecliError if the limit on the address space (ulimit -v) is too low for the
+    libraries.
 
-    Where it is lower, these libraries abort without a message. They reserve a buffer for each core.
+    The numerical libraries reserve a buffer for each core, and abort without a message if this
+    fails.
     """
     needed = 1.5e9 + 64 * 2**20 * (os.cpu_count() or 1)
     if (most := _address_space_limit()) < needed:
-        limit = f"the limit on the memory of this process is {most / 1e9:.1f} GB (ulimit -v)"
         raise SplinecliError(
-            f"{limit}, but at least {needed / 1e9:.1f} GB are needed", hint="Raise the limit"
+            f"the memory limit of this process is {most / 1e9:.1f} GB (ulimit -v), but at least"
+            f" {needed / 1e9:.1f} GB are needed",
+            hint="Raise the limit",
         )
 
 
 def keep_freed_memory() -> None:
     """Let the C library keep freed blocks for the next arrays, if it is glibc.
 
-    By default it returns large blocks to the system, which then clears new pages for every array.
-    That takes about a third of the time of networks and of reading. Blocks above 128 MiB are still
+    By default, it returns large blocks to the system, which clears new pages for every array. This
+    takes about a third of the time for networks and for reading. Blocks above 128 MiB are still
     returned.
     """
     mallopt = _of_c_library("mallopt")
@@ -127,15 +131,16 @@ def keep_freed_memory() -> None:
 
 
 def return_freed_memory() -> None:
-    """Return freed blocks to the system between two stages, if the C library is glibc; see
-    keep_freed_memory.
+    """Return freed blocks to the system between two stages, if the C library is glibc.
+
+    See keep_freed_memory.
     """
     _of_c_library("malloc_trim")(0)
 
 
 def _of_c_library(name: str) -> Callable[..., object]:
-    """Return a function of the C library, or one that does nothing if the library lacks this
-    name.
+    """Return a function of the C library, or one that does nothing if the library does not have
+    it.
     """
     try:
         import ctypes
@@ -151,10 +156,9 @@ def free_memory() -> float:
 
 
 def _left_in_group(folder: Path) -> float:
-    """Return the bytes left under the limit of a control group. The group's file cache can be
-    freed.
+    """Return the bytes left under the limit of a control group, including its file cache.
 
-    Without a limit it is infinity or, in version 1, a huge number.
+    Without a limit, it is infinity or, in version 1, a huge number.
     """
     for limit, use, cache in _GROUP_FILES:
         try:
@@ -187,7 +191,7 @@ def _value_after(name: str, path: Path, otherwise: float) -> float:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether an error means that memory ran out, in Python, PyTorch or the loading of a
+    """Return whether an error means that memory ran out in Python, in PyTorch or while loading a
     library.
     """
     text, of_library = str(error).lower(), isinstance(error, OSError | RuntimeError | ImportError)
@@ -207,8 +211,9 @@ Precision = Literal["auto", "float32", "bfloat16"]
 
 
 def choose_device(name: Device | str) -> torch.device:
-    """Return the device of this name; "auto" is a CUDA GPU if there is one, else the CPU. Raises
-    UsageError.
+    """Return the device with this name; "auto" is a CUDA GPU if there is one, otherwise the CPU.
+
+    Raises UsageError.
     """
     if name not in ("auto", "cpu", "cuda"):
         raise UsageError(f"no device named {name!r}; expected auto, cpu or cuda")
@@ -224,9 +229,10 @@ _HAS_BFLOAT16 = re.compile("(?i)(|ALL|DEFAULT)$|AVX512_CORE_(BF16|FP16|AMX)|AVX1
 
 
 def choose_precision(name: Precision, device: torch.device) -> NumberFormat:
-    """Return the number format of this name; "auto" is bfloat16 if the device supports it natively,
-    and the environment does not limit oneDNN, which computes the convolutions, to instructions
-    without it.
+    """Return the number format with this name.
+
+    "auto" is bfloat16 if the device supports it natively, and if the environment allows oneDNN,
+    which computes the convolutions, to use these instructions.
     """
     if name != "auto":
         return name
@@ -234,7 +240,7 @@ def choose_precision(name: Precision, device: torch.device) -> NumberFormat:
 
     if device.type == "cuda":
         native = torch.cuda.is_bf16_supported(including_emulation=False)
-    else:  # a CPU without the instructions emulates bfloat16, which is slower than float32
+    else:  # without the instructions, bfloat16 is emulated, which is slower than float32
         found = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
         native = bool(found.get("avx512_bf16") or found.get("amx_bf16") or found.get("bf16"))
         limits = (os.environ.get(f"{name}_MAX_CPU_ISA", "ALL") for name in ("ONEDNN", "DNNL"))
@@ -245,10 +251,10 @@ def choose_precision(name: Precision, device: torch.device) -> NumberFormat:
 def use_available_cores() -> None:
     """Limit PyTorch's threads to the cores that this process may use.
 
-    Call it once before a long computation. PyTorch starts one thread per core of the machine, even
-    if a container may use fewer cores. The threads then share the cores, and each step waits for
-    the slowest. The number is only ever lowered, so OMP_NUM_THREADS and torch.set_num_threads keep
-    their effect.
+    Call this once before a long computation. PyTorch starts one thread per core of the machine,
+    even if a container may use fewer cores. Then the threads share the cores, and each step waits
+    for the slowest. The number is never increased, so OMP_NUM_THREADS and torch.set_num_threads
+    remain effective.
     """
     import torch
 
@@ -259,8 +265,8 @@ def use_available_cores() -> None:
 def count_available_cores() -> int:
     """Return the number of cores that this process may use, at least 1.
 
-    It is the smallest of the machine's cores, the process's CPU affinity, and the CPU quota of its
-    control group, which containers and job schedulers set (Linux).
+    It is the minimum of the machine's cores, the process's CPU affinity, and the CPU quota of its
+    control group, which is set by containers and job schedulers (Linux).
     """
     limits = [os.cpu_count() or 1, *cgroup_quotas()]
     if hasattr(os, "sched_getaffinity"):
@@ -269,13 +275,11 @@ def count_available_cores() -> int:
 
 
 def cgroup_quotas() -> list[float]:
-    """Return the CPU quotas, in cores, of this process's control groups and of the groups above
-    them.
-    """
+    """Return the CPU quotas, in cores, of this process's control groups and their parents."""
     quotas = []
     for folder in own_groups("cpu"):
-        # Quota and period in microseconds: in one file of version 2, or in two of version 1. The
-        # first is "max" or -1 without a quota.
+        # Quota and period are in microseconds, in one file (version 2) or two (version 1). Without
+        # a quota, the first is "max" or -1.
         for names in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):
             with suppress(OSError):
                 content = " ".join((folder / name).read_text("utf-8") for name in names)
@@ -292,17 +296,16 @@ _lock, _users, _threads = Lock(), 0, 0
 
 @contextmanager
 def one_thread_each() -> Iterator[int]:
-    """Let each operation of PyTorch use one thread only. Yields the number of threads that it used
-    before.
+    """Limit each operation of PyTorch to one thread, and yield the previous number of threads.
 
-    More threads hardly speed up operations on small arrays, and on a busy machine make them many
+    More threads hardly speed up operations on small arrays. On a busy machine, they make them many
     times slower, because all threads of an operation wait for the slowest.
     """
     import torch
 
     global _users, _threads
-    # Each thread has its own number, and new ones have the number that was set last. So the first
-    # of several callers reads it for all, and each sets it in its own thread.
+    # Each thread has its own number, and new threads have the number that was set last. Therefore,
+    # the first of several callers reads it for all, and each sets it in its own thread.
     with _lock:
         if not _users:
             _threads = torch.get_num_threads()
@@ -323,10 +326,11 @@ def in_order(
     threads: int = 1,
     start: Callable[[], object] | None = None,
 ) -> Iterator[_Result]:
-    """Yield function(part) of each part, in order, computed on this many threads, each of which
-    calls `start` first.
+    """Yield function(part) for each part, in order, computed by several threads that call `start`
+    first.
 
-    At most one more result than there are threads is kept. An error is raised when its part is due.
+    At most one more result than there are threads is kept. Errors are raised when their part is
+    due.
     """
     waiting: deque[Future[_Result]] = deque()
     pool = ThreadPoolExecutor(threads, "part", start)
@@ -343,7 +347,7 @@ def in_order(
 
 @contextmanager
 def meanwhile(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]]:
-    """Start function() on another thread, and yield a callable that waits for its result or raises
+    """Start function() in another thread, and yield a callable that returns its result or raises
     its error.
     """
     with ThreadPoolExecutor(1, "meanwhile") as pool:
@@ -351,15 +355,16 @@ def meanwhile(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
 
 
 def side_by_side(function: Callable[[_Part], _Result], parts: Iterable[_Part]) -> Iterator[_Result]:
-    """Yield function(part) of each part as in_order does, without gradients, on as many threads as
-    PyTorch uses.
+    """Yield function(part) for each part, as in_order does, without gradients, in PyTorch's
+    threads.
 
-    Within the function, each operation of PyTorch uses one thread.
+    The number of threads is PyTorch's. Within the function, each operation of PyTorch uses one
+    thread.
     """
     import torch
 
     with one_thread_each() as threads:
-        # Each new thread has the number of threads of OpenMP, until PyTorch sets its own.
+        # A new thread has OpenMP's number of threads until PyTorch sets its own.
         yield from in_order(
             torch.inference_mode()(function), parts, threads, lambda: torch.set_num_threads(1)
         )

@@ -1,10 +1,10 @@
-"""Sets of output files, in folders that one process at a time writes into.
+"""Sets of output files, in folders to which only one process at a time writes.
 
 Each new file is written under a random hidden name and synced. When all are complete, the earlier
-report is removed, then the earlier files, the new ones are renamed to their places, and the new
-report comes last. So a folder with a report is complete. A folder without one is unfinished, and
-its work is repeated. A later process never acts on instructions in a folder, and never follows a
-link in it.
+report is removed, then the earlier files. The new files are renamed to their places, and the new
+report comes last. Therefore, a folder with a report is complete. A folder without a report is
+unfinished, and its work is repeated. A later process never acts on instructions in a folder, and
+never follows a link in it.
 """
 
 import importlib
@@ -29,20 +29,20 @@ from splinecli.system.files import (
     sync,
 )
 
-LOCK = ".lock"  # the lock file in a folder that one process at a time may write into
+LOCK = ".lock"  # the lock file in a folder to which only one process at a time may write
 
 
 class BusyError(OutputError):
-    """Another process writes into the folder."""
+    """Another process is writing to the folder."""
 
 
 @contextmanager
 def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
-    """Make a folder and lock it; `wait` for another process that has locked it, instead of raising
+    """Create a folder and lock it. If it is locked, `wait` for the other process, or raise
     BusyError.
 
-    Raises OutputError if another user left a lock file that this process may not open, or OSError
-    if the folder cannot be made or written.
+    Raises OutputError if a lock file of another user cannot be opened, or OSError if the folder
+    cannot be created or written.
     """
     with locked_file(folder / LOCK, wait=wait):
         yield
@@ -50,13 +50,13 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
 
 @contextmanager
 def locked_file(path: Path, *, wait: bool = False) -> Iterator[None]:
-    """Make a file and its folder, lock the file as `locked` does, and remove it at the end."""
+    """Create a file and its folder, lock the file as `locked` does, and remove it at the end."""
     file = _locked_file(path, wait=wait)
     try:
         yield
     finally:
-        # Windows does not remove an open file. On other systems, a process that locks a removed
-        # file detects this.
+        # Windows cannot remove an open file. On other systems, a process that locks a removed file
+        # detects this.
         if os.name == "nt":
             file.close()
         with suppress(OSError):
@@ -65,48 +65,49 @@ def locked_file(path: Path, *, wait: bool = False) -> Iterator[None]:
 
 
 def _locked_file(path: Path, *, wait: bool) -> IO[str]:
-    """Return a lock file, open and locked, which is created as needed."""
+    """Return an open and locked lock file, which is created if needed."""
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             file = _open_lock(path)
-        except FileNotFoundError:  # another process removed the folder, because it was empty
+        except FileNotFoundError:  # another process removed the empty folder
             continue
         except PermissionError:
             if not path.exists():
                 raise
             raise OutputError(
-                "this lock file belongs to another user, who may be writing into the folder",
+                "this lock file belongs to another user, who may be writing to the folder",
                 path,
-                hint="If no splinecli process of that user runs, remove the file."
-                " Otherwise choose another -o",
+                hint="If no splinecli process of that user is running, remove the file. Otherwise,"
+                " choose another -o",
             ) from None
         try:
             got = _try_lock(file)
         except OSError:  # some network drives have no locks
             return file
-        # The last owner of a lock file removes it, and others recreate it.
+        # The last owner of a lock file removes it, so other processes create a new one.
         with suppress(FileNotFoundError):
             if got and os.path.samestat(path.stat(), os.fstat(file.fileno())):
                 return file
         file.close()
         if not got and not wait:
             raise BusyError(
-                "another splinecli process is writing into this folder",
+                "another splinecli process is writing to this folder",
                 path.parent,
-                hint="Wait for it to end, or choose another -o",
+                hint="Wait until it is finished, or choose another -o",
             )
         if not got:
             time.sleep(0.02)
 
 
 def _open_lock(path: Path) -> IO[str]:
-    """Open a lock file, which is created as needed. Raises OutputError if it is not a file, but for
-    example a pipe.
+    """Return an open lock file, which is created if needed.
+
+    Raises OutputError if it is not a file but, for example, a pipe.
     """
-    # A pipe would wait for its other end without O_NONBLOCK. A link might lead anywhere.
+    # Without O_NONBLOCK, a pipe would wait for its other end. A link might lead anywhere.
     flags = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)
-    refused = OutputError("is not a file, so it cannot lock the folder", path, hint="Remove it")
+    refused = OutputError("the lock is not a file", path, hint="Remove it")
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | flags, 0o666)
     except (FileNotFoundError, PermissionError):
@@ -122,7 +123,7 @@ def _open_lock(path: Path) -> IO[str]:
 
 
 def _try_lock(file: IO[str]) -> bool:
-    """Lock an open file, unless another process has locked it. Raises OSError if locks are not
+    """Lock an open file, and return whether it was free. Raises OSError if locks are not
     supported.
     """
     try:
@@ -141,21 +142,21 @@ def _try_lock(file: IO[str]) -> bool:
     return True
 
 
-Content = bytes | str | NDArray[Any]  # of a file; see NewFiles.write
-UNDONE = "an interrupted run left unfinished files, which are removed"
+Content = bytes | str | NDArray[Any]  # content of a file; see NewFiles.write
+UNDONE = "unfinished files of an interrupted run were removed"
 
 
 @contextmanager
 def held_folder(
     folder: Path, warn: Callable[[str], object] = lambda _: None, *, wait: bool = False
 ) -> Iterator[None]:
-    """Make a folder, lock it, and remove the unfinished files that killed processes left directly
-    in it.
+    """Create and lock a folder, and remove unfinished files that killed processes left directly in
+    it.
 
-    A folder that was made here and is empty at the end is removed, as are its parents. `warn`
-    receives a sentence about the files of a killed process. Raises BusyError if another process has
-    locked the folder, unless it waits for that, or OutputError if the folder cannot be made or
-    written.
+    If it was created here and is empty at the end, it is removed, including its parents. `warn` is
+    called with a sentence about files of a killed process. If another process has locked the
+    folder, BusyError is raised unless `wait` is set. Raises OutputError if the folder cannot be
+    created or written.
     """
     check_writable(folder)
     with ExitStack() as stack:
@@ -172,7 +173,7 @@ def held_folder(
                         left.append(path)
                 except BusyError:
                     pass  # the probe of another running batch
-                except OutputError:  # another user's, which may be removed but not opened
+                except OutputError:  # a file of another user that can be removed but not opened
                     path.unlink()
                     left.append(path)
             if left:
@@ -181,7 +182,7 @@ def held_folder(
 
 
 class NewFiles:
-    """New files of a folder that have hidden names until all are complete; see new_files."""
+    """New files of a folder, which have hidden names until all are complete; see new_files."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -189,7 +190,7 @@ class NewFiles:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """The bytes of each complete file by its name."""
+        """The size of each complete file in bytes, by name."""
         return {name: path.stat().st_size for name, path in sorted(self.hidden.items())}
 
     def write(self, name: str, content: Content) -> None:
@@ -211,6 +212,7 @@ class NewFiles:
 
     def publish(self, report: str | None, stale: Iterable[str]) -> None:
         """Remove the earlier files, and rename the new ones to their places, the report last.
+
         Raises OSError.
         """
         if report is not None:
@@ -231,15 +233,16 @@ class NewFiles:
 
 @contextmanager
 def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) -> Iterator[NewFiles]:
-    """Yield a collector of new files. After the block, they replace the earlier ones.
+    """Yield a collector of new files, which replace the earlier ones after the block.
 
-    The caller must hold the folder (see held_folder). If the block fails, the earlier files are
-    kept unchanged. A process that ends during the replacement leaves a folder without a report.
-    Raises OutputError if a file cannot be written.
+    The caller must hold the folder (see held_folder). If the block fails, the earlier files remain
+    unchanged. If the process ends during the replacement, the folder has no report. Raises
+    OutputError if a file cannot be written.
 
-    `report` names the file that describes the others: removed first, written last. It is None if
-    the caller ensures that no report names a file that changes. `stale` names earlier files that
-    are removed if no new file replaces them.
+    Args:
+        report: the file that describes the others, which is removed first and written last. None if
+            the caller ensures that no report describes a file that changes.
+        stale: earlier files, which are removed if they are not replaced.
     """
     new = NewFiles(folder)
     try:
@@ -252,7 +255,7 @@ def new_files(folder: Path, *, report: str | None, stale: Iterable[str] = ()) ->
 
 
 def refuse_link(folder: Path) -> None:
-    """Raise OutputError if a folder is in fact a link, which may lead anywhere."""
+    """Raise OutputError if a folder is a link, which may lead anywhere."""
     if folder.is_symlink():
         raise OutputError(
             "found a link, expected a folder", folder, hint="Remove it, or choose another -o"
@@ -260,12 +263,12 @@ def refuse_link(folder: Path) -> None:
 
 
 def is_plain(path: Path) -> bool:
-    """Return whether the path is a file, and not a link to one."""
+    """Return whether the path is a file and not a link."""
     return path.is_file() and not path.is_symlink()
 
 
 def _check_place(path: Path, folder: Path) -> None:
-    """Raise OutputError if no file can be renamed to a path in a folder or its subfolders."""
+    """Raise OutputError if a file cannot be renamed to this path in a folder or its subfolders."""
     if path.is_dir() and not path.is_symlink():
         raise OutputError("found a folder, expected a file", path)
     if path.parent == folder:
@@ -276,8 +279,9 @@ def _check_place(path: Path, folder: Path) -> None:
 
 
 def _remove(path: Path, folder: Path) -> None:
-    """Remove a file or a link. A folder of that name is kept. Raises OutputError as _check_place
-    does, or OSError.
+    """Remove a file or a link, but not a folder.
+
+    Raises OutputError as _check_place does, or OSError.
     """
     if path.parent != folder:
         refuse_link(path.parent)

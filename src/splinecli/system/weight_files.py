@@ -14,15 +14,15 @@ from torch import Tensor, nn
 from splinecli.errors import ModelError
 from splinecli.system.files import file_sha256, is_special, parse_json, utf8_name
 
-# Largest tensor file to read, in bytes. A checkpoint of the paper's networks has 170 MB
+# Largest size of a tensor file in bytes. A checkpoint of the paper's networks has 170 MB.
 LONGEST = 500_000_000
-LENGTH_BYTES = 8  # size of the header length at the start of a safetensors file
+LENGTH_BYTES = 8  # bytes at the start of a safetensors file that contain the length of the header
 Module = TypeVar("Module", bound=nn.Module)
 SHIPPED = resources.files("splinecli") / "assets"
 
 
 def tensors_sha256(tensors: dict[str, Tensor]) -> str:
-    """Return the SHA-256 of the tensors' names, types, shapes and bytes, sorted by name."""
+    """Return the SHA-256 of the names, types, shapes and bytes of tensors, sorted by name."""
     digest = hashlib.sha256()
     for name in sorted(tensors):
         tensor = tensors[name]
@@ -34,40 +34,40 @@ def tensors_sha256(tensors: dict[str, Tensor]) -> str:
 def read_tensors(
     path: Path, expected_format: str, hint: str
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read the tensors and the metadata of a safetensors file of splinecli, and verify its format
-    and checksum.
+    """Return the tensors and the metadata of a safetensors file of splinecli.
 
-    Raises ModelError, with the hint, if the file is missing, damaged or in another format.
+    The format and the checksum are verified. Raises ModelError, with the hint, if the file is
+    missing, damaged or in another format.
     """
     try:
         if path.is_dir():
-            raise ModelError("is a folder", path, hint=hint)
+            raise ModelError("found a folder, expected a weight file", path, hint=hint)
         if is_special(path):
-            raise ModelError("is not a file", path, hint=hint)
+            raise ModelError("this is not a file", path, hint=hint)
         if not path.is_file():
-            raise ModelError("no such file", path, hint=hint)
+            raise ModelError("the file does not exist", path, hint=hint)
         check_length(path, hint)
         with path.open("rb") as start:
             length = int.from_bytes(start.read(LENGTH_BYTES), "little")
-            if length > 1 << 20:  # a tensor takes about 100
-                raise SafetensorError(f"a header of {length} bytes")
+            if length > 1 << 20:  # a tensor needs about 100 bytes
+                raise SafetensorError(f"the header has {length} bytes")
             with safe_open(utf8_name(path, start), framework="pt") as file:
                 metadata = file.metadata() or {}
                 found = metadata.get("format", "none")
                 if found != expected_format:
                     raise ModelError(
-                        f"wrong format: found {found}, expected {expected_format}",
+                        f"found the format {found}, expected {expected_format}",
                         path,
                         hint=hint,
                     )
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError) as error:
         raise ModelError(
-            f"not a safetensors file, or cut short ({error})", path, hint=hint
+            f"this is not a safetensors file, or it is truncated ({error})", path, hint=hint
         ) from error
     if metadata.get("tensors_sha256") != tensors_sha256(tensors):
         raise ModelError(
-            "damaged: the tensors do not match the checksum in the file", path, hint=hint
+            "the file is damaged: the tensors do not match its checksum", path, hint=hint
         )
     return tensors, metadata
 
@@ -82,22 +82,20 @@ def check_length(path: Path, hint: str) -> None:
 def read_json_entry(
     metadata: dict[str, str], key: str, path: Path, kind: Any = dict[str, Any]
 ) -> Any:
-    """Return the JSON object under a key of a file's metadata, or the record of this kind. Raises
-    ModelError.
+    """Return the JSON object in an entry of a file's metadata, optionally as a record of this kind.
 
-    The checksum does not cover it.
+    The checksum does not cover the metadata. Raises ModelError.
     """
     try:
         return parse_json(metadata.get(key, ""), kind)
     except ValueError as error:
-        raise ModelError(
-            f"the entry {key!r} in the file is not JSON of the expected form ({error})", path
-        ) from error
+        raise ModelError(f"the entry {key!r} in the file is not valid ({error})", path) from error
 
 
 def load_strictly(network: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
-    """Load the tensors into the network. Raises ModelError for a missing, unknown or misshapen
-    tensor.
+    """Load the tensors into the network.
+
+    Raises ModelError for a missing, unknown or misshapen tensor.
     """
     try:
         network.load_state_dict(tensors, strict=True)
@@ -122,6 +120,7 @@ def load_module(module: Module, path: Path, expected_format: str) -> Module:
 def check_shipped(path: Path, sha256: str, name: str) -> None:
     if file_sha256(path) != sha256:
         raise ModelError(
-            f"the shipped weights {name!r} were changed: their SHA-256 does not match weights.json",
+            f"the shipped weights {name!r} were modified, because their SHA-256 does not match"
+            " weights.json",
             hint="Reinstall splinecli",
         )

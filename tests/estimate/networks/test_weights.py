@@ -138,7 +138,7 @@ def test_somebody_else_s_safetensors(tmp_path):
     path = tmp_path / "other.safetensors"
     # bfloat16, which numpy does not know: the format is read before any tensor.
     save_file({"weight": torch.zeros(3, dtype=torch.bfloat16)}, path)
-    with pytest.raises(ModelError, match="wrong format: found none, expected splinecli-weights-1"):
+    with pytest.raises(ModelError, match="found the format none, expected splinecli-weights-1"):
         load_weights(path)
 
 
@@ -188,7 +188,7 @@ def test_countless_empty_tensors_are_refused_unread(tmp_path):
     header = json.dumps({str(number): empty for number in range(30_000)}).encode()
     (tmp_path / "a.safetensors").write_bytes(len(header).to_bytes(8, "little") + header)
     with pytest.raises(
-        ModelError, match=r"not a safetensors file, or cut short \(a header of \d+ b"
+        ModelError, match=r"not a safetensors file, or it is truncated \(the header has \d+ b"
     ):
         load_weights(tmp_path / "a.safetensors")
 
