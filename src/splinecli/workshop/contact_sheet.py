@@ -18,9 +18,8 @@ MOST_SCENES = 120
 
 
 def contact_sheet(pixel_set: PixelSet) -> Picture:
-    """Return an RGB picture (H, W, 3) with a strip for each scene.
-
-    Of many scenes, MOST_SCENES are chosen evenly.
+    """Return an RGB picture (H, W, 3) with a strip for each scene, or for MOST_SCENES evenly chosen
+    scenes.
     """
     scenes: dict[str, list[Entry]] = {}
     for entry in pixel_set.entries:

@@ -131,9 +131,8 @@ def _rename(
 
 
 def _read_state(path: Path) -> dict[str, Tensor]:
-    """Read the tensors in a file written by torch.save.
-
-    Only tensors and plain containers are unpickled.
+    """Return the tensors in a file written by torch.save. Only tensors and plain containers are
+    unpickled.
     """
     hint = "Give a checkpoint of the authors' PyTorch code, such as 200000-G.ckpt"
     try:
@@ -168,15 +167,14 @@ def _read_state(path: Path) -> dict[str, Tensor]:
 
 
 def _check_content(path: Path) -> None:
-    """Raise ValueError for a checkpoint that would use far more memory than its file size.
+    """Raise ValueError for a checkpoint that would need far more memory than its file size.
 
-    It may be an archive with uncompressed records, as written by torch.save since 1.6, or pickles
-    and numbers.
+    It is either an archive with uncompressed records, as written by torch.save since version 1.6,
+    or a sequence of pickles and numbers.
     """
     with path.open("rb") as file:
         if file.read(4) == b"PK\3\4":
-            # Count the records before reading the directory, which has one such mark for each
-            # record.
+            # Count the records by their marks in the directory before it is read.
             if (
                 sum(part.count(b"PK\1\2") for part in iter(lambda: file.read(1 << 20), b""))
                 > _MOST_RECORDS

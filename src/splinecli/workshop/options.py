@@ -68,10 +68,10 @@ class PrepareOptions(Display, frozen=True, kw_only=True):
 
 
 def parse_light_counts(text: str) -> dict[str, int]:
-    """Parse --n-lights, "K" or "MIN-MAX", into settings of the pixels.
+    """Return the settings of the pixels for --n-lights, "K" or "MIN-MAX".
 
     The usual number of lights is 10, as published, or the nearest number in the range. Raises
-    UsageError if the text is not a valid range, or a pixel would have fewer than 3 lights.
+    UsageError if the text is not a valid range, or if a pixel would have fewer than 3 lights.
     """
     low, dash, high = text.partition("-")
     try:

@@ -28,10 +28,10 @@ from splinecli.workshop.synthesis.scenes import SceneConfig
 def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> dict[str, Any]:
     """Write a pixel set, or add to it, and return its summary, which `prepare --json` prints.
 
-    A capture that cannot be used is left out, and the observer receives the error; `skipped` in the
-    summary holds the reason and an exit code. Any other error stops the work, and calling the
-    function again resumes it: InputError for a mesh, OutputError, also for a scene with other
-    settings in the set, or UsageError if there is nothing to prepare.
+    A capture that cannot be used is left out, and the observer is told the error; `skipped` in the
+    summary contains the reason and an exit code. Any other error stops the work, and calling the
+    function again resumes it: InputError for a mesh, OutputError also if the set contains a scene
+    with other settings, or UsageError if there is nothing to prepare.
     """
     output, usual = options.output, SceneConfig()
     size, n_lights = options.size or usual.size, options.n_lights or usual.lights
@@ -108,10 +108,8 @@ def _render_scenes(
 ) -> None:
     """Render the scenes missing from the set, and add them in the order of the plan.
 
-    This process or workers render them.
-
-    Raises LostError if the workers of a scene were lost (after finishing all other scenes), and any
-    error from a worker or the set.
+    They are rendered by this process or by workers. Raises any error of a worker or the set, and
+    LostError if the workers of a scene were lost, after finishing all other scenes.
     """
     reached = 0.0
 
@@ -130,7 +128,7 @@ def _render_scenes(
 
 
 def _missing(writer: PixelSetWriter, plan: ScenePlan) -> list[int]:
-    """Return the positions of the plan's scenes that are not in the set, or not whole."""
+    """Return the positions of the plan's scenes that are not in the set, or not complete."""
     names = map(plan.entry_names, range(len(plan.names)))
     return [n for n, each in enumerate(names) if not all(name in writer for name in each.values())]
 
@@ -138,7 +136,7 @@ def _missing(writer: PixelSetWriter, plan: ScenePlan) -> list[int]:
 def _add_here(
     writer: PixelSetWriter, plan: ScenePlan, reach: Callable[[float], None]
 ) -> Generator[int, None, None]:
-    """Add the missing scenes to the set, and yield the position of each scene that is in it."""
+    """Add the missing scenes to the set, and yield the position of each scene of the plan."""
     missing = _missing(writer, plan)
     for position in range(len(plan.names)):
         if position in missing:
@@ -149,9 +147,9 @@ def _add_here(
 def _add_from_workers(
     cluster: ClusterOptions, observer: Observer, writer: PixelSetWriter, plan: ScenePlan, _: object
 ) -> Generator[int, None, None]:
-    """Do the same with scenes that workers render. The order is that of the plan."""
+    """Do the same as _add_here with scenes that workers render. The order is that of the plan."""
     missing = _missing(writer, plan)
-    # What is rendered, by position: its shape, an error, or None for a scene in the set.
+    # Results by position: the shape that was rendered, an error, or None for a scene in the set.
     rendered: dict[int, str | LostError | None] = {}
     position, folder = 0, writer.folder
     # A worker writes a scene to a hidden file of the set. Only this process adds it to the set.

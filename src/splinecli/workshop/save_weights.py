@@ -1,4 +1,4 @@
-"""Write weight files: safetensors, with the checksum of their tensors."""
+"""Write weight files, which are safetensors with a checksum of the tensors."""
 
 import json
 from pathlib import Path

@@ -1,1 +1,1 @@
-"""Training pixels on disk, and their creation."""
+"""Training pixels on disk, and how they are created."""

@@ -1,4 +1,4 @@
-"""Creation of pixel-set entries from captures with ground truth and from rendered scenes."""
+"""Entries of pixel sets, created from captures with ground truth and from rendered scenes."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class CaptureChangedError(OutputError):
 
 
 def name_captures(folders: Sequence[Path], writer: PixelSetWriter) -> dict[str, Path]:
-    """Choose an entry name for each capture, and return the folders by name.
+    """Return the folders of the captures by the names of their entries.
 
-    A capture already in the set keeps its name. A new capture is named after its folder, with a
-    number if another capture has that name. Duplicate folders are used only once, because the same
-    pixels must not be used for both training and validation.
+    A capture that is already in the set keeps its name. A new capture is named after its folder,
+    with a number if another capture has that name. Duplicate folders are used only once, because
+    the same pixels must not be used for both training and validation.
     """
     captures: dict[str, Path] = {}
     for resolved, folder in {folder.resolve(): folder for folder in folders}.items():
@@ -55,16 +55,16 @@ def add_capture(
     white_level: float | None = None,
     update: bool = False,
 ) -> None:
-    """Read a capture and write its pixels with ground truth, unless the set has them.
+    """Read a capture and write its pixels with ground truth, unless the set already contains them.
 
-    For the PRPS images of CyclesPS, only every second row and column is used, because CNN-PS trains
-    on them at half resolution. By default, saturated observations, from `white_level` if it is
-    given, are restored and unknown light intensities are estimated, as `infer` does; `as_stored`
-    leaves the values unchanged. `update` replaces an entry whose capture changed.
+    For the PRPS images of CyclesPS, only every second row and column is used, because CNN-PS is
+    trained on them at half resolution. By default, saturated observations (from `white_level`, if
+    it is given) are restored and unknown light intensities are estimated, as in `infer`; with
+    `as_stored`, the values are unchanged. `update` replaces an entry whose capture has changed.
 
-    Raises InputError if the capture cannot be read, or has no ground truth; CaptureChangedError if
-    it changed since its entry was created, and `update` is not set; OutputError if the entry cannot
-    be written.
+    Raises InputError if the capture cannot be read or has no ground truth; CaptureChangedError if
+    it has changed since its entry was created, and `update` is not set; OutputError if the entry
+    cannot be written.
     """
     source = open_capture(folder, CaptureOptions(white_level=white_level))
     recipe: dict[str, Any] = {
@@ -123,11 +123,9 @@ RENDERER = 6
 
 @dataclass(frozen=True, eq=False)
 class ScenePlan:
-    """The scenes to render: first the views of each mesh file, then `count` random scenes, then
-    `groups`.
+    """The scenes to render: the views of each mesh file, then `count` random scenes, then `groups`.
 
-    With groups, of which the meshes are a part, there are no scenes of one mesh alone unless
-    `views` is above 0.
+    With groups, which include the meshes, meshes are only rendered alone if `views` is above 0.
     """
 
     config: SceneConfig
@@ -140,7 +138,7 @@ class ScenePlan:
 
     @cached_property
     def _of_mesh(self) -> tuple[tuple[Path, str, int], ...]:
-        """The mesh, name and number of each mesh scene; the number does not depend on the count of
+        """The mesh, name and number of each mesh scene. The number does not depend on the number of
         views.
 
         The name is the file name, with a number if another mesh has the same name.
@@ -196,8 +194,8 @@ class ScenePlan:
     def check_inputs(self) -> None:
         """Check the inputs before rendering.
 
-        Raises InputError if a mesh cannot be used, or UsageError if there are scenes and the
-        packages of the extra `render` are not installed.
+        Raises InputError if a mesh cannot be used, or UsageError if there are scenes to render but
+        the packages of the extra `render` are not installed.
         """
         if self.names:
             for package in ("embreex.rtcore_scene", "skimage.measure"):
@@ -223,11 +221,11 @@ class ScenePlan:
     def render(
         self, position: int, progress: Callable[[float], None] | None = None
     ) -> tuple[str, dict[str, Pixels]]:
-        """Render a scene; return its shape in words, and the pixels by material.
+        """Render a scene, and return a description of its shape and the pixels by material.
 
         `progress` is called with the finished share, 0 to 1. Raises InputError if the mesh cannot
-        be used, or nothing is visible to the camera; UsageError if the packages of the extra
-        `render` are not installed.
+        be used or nothing is visible, and UsageError if the packages of the extra `render` are not
+        installed.
         """
         mesh_file = mesh = group = None
         index = position - len(self._of_mesh)

@@ -21,7 +21,7 @@ FILL_ROUNDS = 3  # each round extends one cell further from the cells with a lig
 
 @dataclass(frozen=True)
 class SampledPixels:
-    """The ground truth of P pixels from a pixel set, under up to F lights each."""
+    """P pixels of a pixel set with their ground truth, under up to F lights each."""
 
     normals: Tensor  # (P, 3) unit normals
     radiance: Tensor  # (P, F)
@@ -29,9 +29,7 @@ class SampledPixels:
     known: Tensor  # (P, F), False for the padding of pixels with fewer lights
 
     def rotate(self, cosine: Tensor, sine: Tensor) -> SampledPixels:
-        """Rotate each pixel about the view axis by its own angle, given as cosine (P,) and sine
-        (P,).
-        """
+        """Rotate each pixel about the view axis by its own angle, given as cosine and sine (P,)."""
         lights = rotate_about_view_axis(self.light_directions, cosine[:, None], sine[:, None])
         return SampledPixels(
             rotate_about_view_axis(self.normals, cosine, sine), self.radiance, lights, self.known
@@ -45,13 +43,13 @@ class SampledPixels:
 
 
 def fill_gaps(values: Tensor, known: Tensor, inside: Tensor) -> DenseMap:
-    """Interpolate between given cells. The result's `known` marks the given cells, its `filled` all
-    usable cells.
+    """Interpolate between known cells. In the result, `known` marks these and `filled` all usable
+    cells.
 
     In each of FILL_ROUNDS rounds, a cell without a value gets the weighted mean of its eight
-    neighbours. A cell stays empty if all its neighbours with a value are on one side. Values and
-    `known`, 1 in cells with an observation, else 0, are (P, 1, w, w); `inside` (w, w) is 1 in the
-    unit disc, outside of which cells stay empty.
+    neighbours. A cell remains empty if all its neighbours with a value are on one side. Values and
+    `known`, 1 in cells with an observation and 0 elsewhere, are (P, 1, w, w); `inside` (w, w) is 1
+    in the unit disc, outside of which cells remain empty.
     """
     near = values.new_tensor([[1.0, 2.0, 1.0], [2.0, 0.0, 2.0], [1.0, 2.0, 1.0]])
     across = near * values.new_tensor([-1.0, 0.0, 1.0])
@@ -73,8 +71,7 @@ def fill_gaps(values: Tensor, known: Tensor, inside: Tensor) -> DenseMap:
 
 
 class PixelSetSource:
-    """Draws pixels from some entries of a set, all with equal probability, under randomly chosen
-    lights.
+    """Draws pixels from entries of a set, all with equal probability, under random lights.
 
     The lights are drawn within a cone; see choose_in_cone. All pixels of a capture (CaptureConfig)
     come from one entry and have the same lights. Batches are on the device of the generator.
@@ -108,7 +105,7 @@ class PixelSetSource:
         return photograph_captures(truth, radiance, directions, valid, config, self.generator)
 
     def _choose_lights(self, truth: SampledPixels, counts: Tensor) -> tuple[Tensor, Tensor]:
-        """Return light indices (P, K) and a mask of the used ones, from the number of lights per
+        """Return light indices (P, K) and a mask of the used ones, for the number of lights per
         capture (G,).
         """
         captures = len(counts)
@@ -169,8 +166,8 @@ class PixelSetSource:
     def _arrays(
         self, index: int
     ) -> tuple[NDArray[np.floating], NDArray[np.float32], NDArray[np.float32]]:
-        """Return an entry's observations, which stay on disk,
-        its normals and its light directions.
+        """Return an entry's observations, which remain on disk, its normals and its light
+        directions.
         """
         if index not in self._observations:
             pixels = self.pixel_set.load(self.entries[index])

@@ -1,15 +1,16 @@
 """Pixel sets on disk: pixels with known normals under many lights, as memory-mapped arrays and a
 manifest.
 
-    SET/manifest.json                       format, version, entries with counts, recipes and
-    checksums SET/<entry>/observations.npy            (P, F), linear; float16 if rendered, float32
-    if read from a capture SET/<entry>/normals.npy                 (P, 3) float32, unit
-    SET/<entry>/light_directions.npy        (F, 3) float32, unit
-    SET/<entry>/mask.npy                    (H, W) bool with P true pixels; P runs in row-major
-    order
+A set SET contains
 
-Sets are written entry by entry, so that an interrupted command can continue. Training refuses an
-unfinished set.
+- manifest.json: format, version, and the entries with counts, recipes and checksums;
+- <entry>/observations.npy: (P, F), linear, float16 if rendered and float32 if read from a capture;
+- <entry>/normals.npy: (P, 3) float32, unit;
+- <entry>/light_directions.npy: (F, 3) float32, unit;
+- <entry>/mask.npy: (H, W) bool with P true pixels, where P is in row-major order.
+
+Sets are written entry by entry, so that an interrupted command can continue. An unfinished set is
+not accepted for training.
 """
 
 import hashlib
@@ -86,8 +87,9 @@ class PixelSet:
         return [f"{entry.name}/{array}.npy" for entry in self.entries for array in ARRAYS]
 
     def load(self, entry: Entry) -> Pixels:
-        """Map the arrays of an entry into memory. Raises InputError if they do not match the
-        manifest.
+        """Return the arrays of an entry, mapped into memory.
+
+        Raises InputError if they do not match the manifest.
         """
         # Convert to plain arrays, because slicing an np.memmap object takes ten times as long.
         pixels = Pixels(
@@ -100,8 +102,8 @@ class PixelSet:
 def open_pixel_set(folder: Path) -> PixelSet:
     """Open a set after comparing every file with the checksums in its manifest.
 
-    Raises InputError if the set is unfinished or empty, or a file is missing or changed. The error
-    names the file.
+    Raises InputError, which names the file, if the set is unfinished or empty, or if a file is
+    missing or was changed.
     """
     manifest = read_manifest(folder)
     if not manifest.complete:
@@ -120,8 +122,9 @@ def open_pixel_set(folder: Path) -> PixelSet:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """Read the manifest of a set, finished or not. Raises InputError, which names a field that is
-    missing or wrong.
+    """Return the manifest of a set, finished or not.
+
+    Raises InputError, which names the field that is missing or invalid.
     """
     path = folder / MANIFEST
     try:
@@ -195,7 +198,7 @@ def _check_arrays(entry: Entry, pixels: Pixels, folder: Path) -> None:
 
 
 def _map(path: Path) -> np.memmap[Any, Any]:
-    """Map the array of a file into memory. Raises InputError."""
+    """Return the array in a file, mapped into memory. Raises InputError."""
     if not path.is_file():
         raise _mismatch(path, "no plain file", "an array")
     try:
@@ -219,13 +222,15 @@ def _mismatch(path: Path, found: str, expected: str) -> InputError:
 class PixelSetWriter:
     """Writes a new set, or adds entries to an existing one, finished or not.
 
-    The manifest never lists an entry whose files are being changed: the entry is removed before and
-    added afterwards.
+    The manifest never lists an entry while its files are being changed, because the entry is
+    removed before and added afterwards.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Open the folder. Raises OutputError if it cannot be written or has other files;
-        InputError if damaged.
+        """Open the folder.
+
+        Raises OutputError if it cannot be written or contains other files, and InputError if the
+        set is damaged.
         """
         check_writable(folder)
         self.folder = folder
@@ -255,8 +260,8 @@ class PixelSetWriter:
         return self._entries[name].recipe
 
     def difference(self, name: str, recipe: dict[str, Any]) -> str | None:
-        """Describe the first setting in which an entry's recipe differs, with both values; None if
-        they are equal.
+        """Return a description of the first setting in which an entry's recipe differs; None if
+        there is none.
         """
         asked, found = _plain(recipe), self._entries[name].recipe
         for key in [*asked, *found]:
@@ -274,7 +279,7 @@ class PixelSetWriter:
     ) -> None:
         """Write an entry of at least one pixel, replacing any earlier entry with the same name.
 
-        Raises OutputError if it cannot be written. The other entries are not affected.
+        The other entries are not affected. Raises OutputError if it cannot be written.
         """
         n_pixels, n_lights = pixels.observations.shape
         checksums = {}

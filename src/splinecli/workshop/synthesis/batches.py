@@ -1,9 +1,9 @@
 """Batches of training pixels, and the faults of a capture: exposure, noise, quantisation and errors
 of calibration.
 
-Faults are random draws for each pixel from the distributions in the docstrings. They change only
-the sparse observations; the dense map stays the ground truth. Observations are linear, and 1 is the
-sensor's full scale.
+Faults are drawn for each pixel from the distributions in the docstrings. They change only the
+sparse observations, while the dense map remains the ground truth. Observations are linear, and 1 is
+the full scale of the sensor.
 """
 
 import math
@@ -25,10 +25,10 @@ from splinecli.workshop.synthesis.lights import draw_light_counts
 def disturb_light_directions(
     directions: Tensor, share: float, generator: torch.Generator
 ) -> Tensor:
-    """Add Gaussian calibration errors to the directions (P, F, 3) of a share of the pixels.
+    """Return the directions (P, F, 3) with Gaussian calibration errors for a share of the pixels.
 
-    Their sigma along either axis is 8 U(0, 1)^3 degrees: the median is 1 degree, and a fifth
-    exceeds 4.
+    Their sigma along either axis is 8 U(0, 1)^3 degrees, which has a median of 1 degree and exceeds
+    4 for a fifth.
     """
     pixels = len(directions)
     sigma = math.radians(8.0) * draw_uniform(generator, pixels, 1, 1) ** 3
@@ -43,8 +43,10 @@ def disturb_light_directions(
 def disturb_light_intensities(
     observations: Tensor, share: float, generator: torch.Generator
 ) -> Tensor:
-    """Multiply observations (P, F) by Gaussian intensity errors, sigma U(0, 5 %), for a share of
-    the pixels.
+    """Return the observations (P, F) with Gaussian errors of the intensities for a share of the
+    pixels.
+
+    Their sigma is U(0, 5 %).
     """
     sigma = draw_uniform(generator, len(observations), 1, high=0.05) * (
         draw_uniform(generator, len(observations), 1) < share
@@ -58,11 +60,11 @@ def disturb_light_intensities(
 def draw_light_intensities(
     pixels: int, lights: int, share: float, generator: torch.Generator
 ) -> Tensor:
-    """Draw relative light intensities (P, F), the largest 1; for a share of the pixels 2^U(-2, 0),
-    else equal ones.
+    """Draw relative light intensities (P, F), of which the largest is 1.
 
-    Images are taken with unequal lamps and divided by the intensities afterwards, so the
-    observations under a weak lamp have coarser steps and more noise.
+    They are 2^U(-2, 0) for a share of the pixels, and equal for the others. Images are taken with
+    unequal lamps and divided by the intensities afterwards, so the observations under a weak lamp
+    have coarser steps and more noise.
     """
     unequal = draw_uniform(generator, pixels, 1) < share
     intensities = 2 ** draw_uniform(generator, pixels, lights, low=-2.0, high=0.0)
@@ -70,12 +72,12 @@ def draw_light_intensities(
 
 
 def draw_exposure(radiance: Tensor, saturated_share: float, generator: torch.Generator) -> Tensor:
-    """Draw the factor (P, 1) from each pixel's radiance (P, F) to the sensor's range, of which 1 is
-    full scale.
+    """Draw the factor (P, 1) from each pixel's radiance (P, F) to the sensor's range, whose full
+    scale is 1.
 
     The brightest observation of a pixel is 10^U(-2.7, -0.7) for 40 % of the pixels, which are dark
-    compared with the brightest in their capture, else 10^U(-1.3, 0). For `saturated_share` of the
-    pixels it is U(1, 3), to be clipped.
+    compared with the brightest in their capture, and 10^U(-1.3, 0) for the others. For
+    `saturated_share` of the pixels it is U(1, 3), to be clipped.
     """
     pixels = len(radiance)
     dark = draw_uniform(generator, pixels, 1) < 0.4
@@ -87,11 +89,11 @@ def draw_exposure(radiance: Tensor, saturated_share: float, generator: torch.Gen
 
 
 def add_sensor_noise(exposed: Tensor, generator: torch.Generator) -> Tensor:
-    """Add read noise 10^U(-4, -2.5) and shot noise sqrt(I) 10^U(-3.5, -2) of full scale, both
-    Gaussian.
+    """Return values with Gaussian read noise and shot noise.
 
-    The read noise is at most a thirtieth of a pixel's largest observation, because darker captures
-    are rarely kept.
+    Read noise is 10^U(-4, -2.5) of full scale, and shot noise sqrt(I) 10^U(-3.5, -2). The read
+    noise is at most a thirtieth of a pixel's largest observation, because darker captures are
+    rarely kept.
     """
     pixels = len(exposed)
     read = 10 ** draw_uniform(generator, pixels, 1, low=-4.0, high=-2.5)
@@ -103,7 +105,8 @@ def add_sensor_noise(exposed: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def quantise(exposed: Tensor, eight_bit_share: float, generator: torch.Generator) -> Tensor:
-    """Quantise values from 0 to 1: to 8 bits for a share of the pixels, else to 10, 12, 14 or 16.
+    """Return values from 0 to 1, quantised to 8 bits for a share of the pixels and to 10 to 16 for
+    others.
 
     Half of the 8-bit pixels are encoded with the sRGB curve, rounded and decoded again. Of the
     others, half are rounded and half truncated, as when only the high byte of 16 bits is kept.
@@ -127,10 +130,10 @@ def quantise(exposed: Tensor, eight_bit_share: float, generator: torch.Generator
 def restore(
     observed: Tensor, clipped: Tensor, directions: Tensor, valid: Tensor, generator: torch.Generator
 ) -> Tensor:
-    """Restore the clipped observations of half of the pixels, as `infer` does; others stay at full
-    scale.
+    """Return observations in which half of the pixels' clipped values are restored, as in `infer`.
 
-    All arrays are (P, F), except the unit directions (P, F, 3). Invalid observations are ignored.
+    The others stay at full scale. All arrays are (P, F), except the unit directions (P, F, 3).
+    Invalid observations are ignored.
     """
     chosen = (draw_uniform(generator, len(observed), 1) < 0.5)[:, 0] & clipped.any(dim=1)
     rows = chosen.nonzero()[:, 0]
@@ -148,8 +151,9 @@ LightCount = Annotated[int, Meta(ge=3)]
 
 @dataclass(frozen=True)
 class CaptureConfig:
-    """How pixels are photographed, and how often each fault occurs, as a share of the pixels; 0
-    disables a fault.
+    """How pixels are photographed, and how often each fault occurs, as a share of the pixels.
+
+    A share of 0 disables a fault.
     """
 
     # min_lights, max_lights, usual_lights, usual_lights_share: see draw_light_counts
@@ -201,7 +205,7 @@ class DenseMap(NamedTuple):
 class PixelTruth(Protocol):
     """The true unit normals (P, 3) and the dense maps of P pixels, at the scale of the radiance.
 
-    `rotate` turns each pixel about the view axis by its own angle, given as cosine and sine (P,).
+    `rotate` rotates each pixel about the view axis by its own angle, given as cosine and sine (P,).
     """
 
     @property
@@ -230,8 +234,10 @@ def photograph(
     config: CaptureConfig,
     generator: torch.Generator,
 ) -> PixelBatch:
-    """Photograph radiance (P, F) under directions (P, F, 3), each pixel with its own camera and
-    calibration faults.
+    """Return a batch of radiance (P, F) under directions (P, F, 3), photographed with random
+    faults.
+
+    Each pixel has its own camera and calibration faults.
     """
     pixels, lights = radiance.shape
     intensities = draw_light_intensities(pixels, lights, config.unequal_lights_share, generator)

@@ -21,8 +21,10 @@ CLASSES = {"diffuse": (0.0, _SHINY), "specular": (_SHINY, _METAL), "metallic": (
 def choose(
     condition: Tensor, first: PrincipledMaterial, second: PrincipledMaterial
 ) -> PrincipledMaterial:
-    """Return the materials of `first` where the condition (P, 1) is true, else of `second`. Both
-    have P pixels.
+    """Return the materials of `first` where the condition (P, 1) is true, and of `second`
+    elsewhere.
+
+    Both have P pixels.
     """
     pairs = zip(vars(first).values(), vars(second).values(), strict=True)
     return PrincipledMaterial(*(torch.where(condition, one, other) for one, other in pairs))
@@ -80,10 +82,10 @@ def draw_material(
 
 
 def with_one_gloss(material: PrincipledMaterial) -> PrincipledMaterial:
-    """Give all rows the material of the first except for the base, as on a painted or printed
+    """Return the materials with the first row's parameters except for the base, as on a painted
     object.
 
-    A metal may then have the dark base of another kind, as if tarnished.
+    A metal may have the dark base of another kind, as if it was tarnished.
     """
     first = material.take(
         torch.zeros(len(material.base), dtype=torch.long, device=material.base.device)

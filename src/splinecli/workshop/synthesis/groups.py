@@ -1,7 +1,7 @@
-"""Groups of bodies that shadow and illuminate each other, and hollows seen from above with bodies
-in them.
+"""Groups of bodies that shadow and illuminate each other, and hollows seen from above that contain
+bodies.
 
-Errors are largest in glossy hollows beside bodies and at sharp edges. Groups are graded by their
+Errors are largest in glossy hollows next to bodies, and at sharp edges. Groups are graded by their
 share of sharp edges, as in PS-Verse (Li et al., "Light of Normals", 2025): from round bodies with
 wide fillets to facets, ridges and cuts.
 """
@@ -68,10 +68,10 @@ def draw_group(
 def _leaning(
     group: Mesh, body: Mesh, rng: np.random.Generator, *, upward: Range, sizes: Range
 ) -> Mesh:
-    """Add a body, scaled by U(sizes), that touches the group at a random point whose normal has a z
-    within `upward`.
+    """Add a body, scaled by U(sizes), that touches the group at a random point.
 
-    Up to a fifth of the depth of the body is below the tangent plane of this point.
+    The z of the point's normal is within `upward`. Up to a fifth of the depth of the body is below
+    the tangent plane of this point.
     """
     z = group.vertex_normals[:, 2]
     places = (
@@ -115,8 +115,8 @@ def draw_body(rng: np.random.Generator, sharpness: float) -> Mesh:
 
 
 def draw_niche(rng: np.random.Generator, sharpness: float) -> Mesh | None:
-    """Draw a wavy slab that fills the frame, with one to four cavities,
-    tilted by up to 15 degrees.
+    """Draw a wavy slab that fills the frame, with one to four cavities, tilted by up to 15
+    degrees.
     """
     swell = draw_waves(rng, (0.3, 0.8), (0.0, 0.3))
     tools = []

@@ -18,11 +18,11 @@ def draw_light_counts(
     *,
     usual_share: float = 0.5,
 ) -> Tensor:
-    """Draw the number of lights of each pixel (P,). Within a draw they differ by at most a fifth.
+    """Draw the number of lights of each pixel (P,). Within a draw, they differ by at most a fifth.
 
-    Each draw has a maximum: for `usual_share` of the draws it is usual - 1 to usual + 2, else it is
-    log-uniform over low..high.
-    Every pixel has at least four fifths of that number, which keeps the padding small.
+    Each draw has a maximum: for `usual_share` of the draws it is usual - 1 to usual + 2, otherwise
+    it is log-uniform over low..high. Every pixel has at least four fifths of that number, so that
+    there is little padding.
     """
     anywhere = low * ((high + 1) / low) ** draw_uniform(generator, 1)
     about = usual - 1 + 4 * draw_uniform(generator, 1)
@@ -35,18 +35,19 @@ def draw_light_counts(
 
 
 def choose_in_cone(directions: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Choose `count` of the light directions (F, 3) at random, within a cone about the view axis;
-    return their indices.
+    """Return `count` random indices of the light directions (F, 3) within a cone about the view
+    axis.
 
-    Its half-angle is U(20, 90) degrees, as in CNN-PS (Ikehata, ECCV 2018). If it contains too few
-    lights, the closest others are added.
+    The half-angle of the cone is U(20, 90) degrees, as in CNN-PS (Ikehata, ECCV 2018). If it
+    contains too few lights, the closest others are added.
     """
     return rank_in_cone(directions[None], generator)[0].argsort()[:count]
 
 
 def rank_in_cone(directions: Tensor, generator: torch.Generator) -> Tensor:
-    """Return ranks (P, F) of the lights (P, F, 3) of P pixels; the lowest ranks are chosen, see
-    choose_in_cone.
+    """Return ranks (P, F) of the lights (P, F, 3) of P pixels, of which the lowest are chosen.
+
+    See choose_in_cone.
     """
     uniform = draw_uniform(generator, *directions.shape[:2])
     half_angle = _uniform_deg(generator, len(directions), 1, low=20, high=90)

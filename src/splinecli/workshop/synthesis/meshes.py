@@ -24,8 +24,8 @@ from splinecli.system.machine import import_extra, is_out_of_memory
 
 Floats = NDArray[np.floating]
 REACH = 0.94  # half-width of the object in the camera's square
-LEAST_EXTENT = 1e-3  # of a mesh in x and y, as a share of its largest side
-LONGEST_EDGE = 0.03  # of a face; longer ones are split
+LEAST_EXTENT = 1e-3  # smallest extent of a mesh in x and y, relative to its largest side
+LONGEST_EDGE = 0.03  # longest edge of a face; faces with longer edges are split
 MOST_FACES = 2_000_000
 _LONGEST = {"ply": 32_000_000, "obj": 32_000_000, "off": 32_000_000, "stl": 84 + 50 * MOST_FACES}
 """Largest file size by format, in bytes. In the first three, one byte may give a triangle of 110
@@ -120,8 +120,9 @@ def _read_known(path: Path) -> tuple[str, bytes]:
 
 
 def fit_to_frame(mesh: Mesh) -> Mesh:
-    """Scale and centre a mesh: its larger extent in x and y becomes 2 * REACH, and its centre the
-    origin.
+    """Return a mesh that is scaled and centred at the origin.
+
+    Its larger extent in x and y is 2 * REACH.
     """
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     scale = 2 * REACH / float((high - low)[:2].max())
@@ -130,8 +131,9 @@ def fit_to_frame(mesh: Mesh) -> Mesh:
 
 
 def split_long_edges(mesh: Mesh, *, longest: float, most_faces: int = MOST_FACES) -> Mesh:
-    """Divide faces into four until no edge is longer than `longest` or there would be more than
-    `most_faces` faces.
+    """Return a mesh whose faces are divided into four until no edge is longer than `longest`.
+
+    Division ends earlier if there would be more than `most_faces` faces.
     """
     # Interpolate positions and normals together, so that the shading stays the same.
     corners = np.concatenate((mesh.vertices, mesh.vertex_normals), axis=1).astype(np.float64)
@@ -275,10 +277,9 @@ def gradient(field: Field, points: Floats, step: float = 1e-3) -> Floats:
 def triangulate(
     field: Field, half_widths: tuple[float, float, float], spacing: float
 ) -> Mesh | None:
-    """Return the surface of a field inside a box around the origin, sampled every `spacing`; None
-    if it is empty.
+    """Return the surface of a field in a box around the origin, sampled at intervals of `spacing`.
 
-    Only the largest connected part is kept.
+    Only the largest connected part is kept. None if the surface is empty.
     """
     from trimesh.graph import connected_component_labels
 
@@ -315,8 +316,9 @@ COARSE = 4
 
 
 def _sample(field: Field, axes: list[Floats], spacing: float) -> Floats:
-    """Sample the field on the grid of three axes: exactly near its surface, with the right sign
-    elsewhere.
+    """Return samples of the field on the grid of three axes.
+
+    They are exact near the surface of the field, and have the correct sign elsewhere.
     """
     coarse = _evaluate(field, *np.meshgrid(*(axis[::COARSE] for axis in axes), indexing="ij"))
     # Fields grow at rates up to about 2. The centre of a cell is half its diagonal away from its

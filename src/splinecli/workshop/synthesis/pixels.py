@@ -1,7 +1,7 @@
-"""The online pixel generator, which makes batches of training pixels on the device of its random
+"""The online pixel generator, which creates batches of training pixels on the device of its
 generator.
 
-Each pixel has its own normal and walls, and either its own material or that shared by its capture.
+Each pixel has its own normal and walls, and either its own material or one shared by its capture.
 Its radiance can be computed under any light: a random rig gives the sparse observations, and the
 directions of all cells give the complete dense map. PX-Net (Logothetis et al., ICCV 2021) trains a
 per-pixel network in this way, without rendered objects.
@@ -28,7 +28,7 @@ from splinecli.workshop.synthesis.whole_capture import photograph_captures
 
 @dataclass(frozen=True)
 class Wall:
-    """A surface beside each pixel that blocks a sector of low lights and reflects the others.
+    """A surface next to each pixel that blocks a sector of low lights and reflects the others.
 
     A pixel without a wall has tan_height = reflectance = 0.
     """
@@ -45,12 +45,12 @@ class Wall:
     has_pixel_material: Tensor
 
     def visibility(self, directions: Tensor) -> Tensor:
-        """Return the share of each light that passes the wall (P, D): a cast shadow over one sector
+        """Return the share of each light that passes the wall (P, D), a cast shadow over a sector
         of the map.
 
         A direction is blocked if its elevation is below the top of the wall, l_z < tan(height)
-        l_along, and it is within the width of the wall, |l_across| < tan(half width) l_along; the
-        edge is `softness` wide in l_z.
+        l_along, and if it is within the width of the wall, |l_across| < tan(half width) l_along.
+        The edge of the shadow is `softness` wide in l_z.
         """
         along = dot(self.azimuth, directions)
         quarter_turn = torch.stack(
@@ -65,11 +65,11 @@ class Wall:
     def reflected(
         self, normals: Tensor, material: PrincipledMaterial, directions: Tensor
     ) -> Tensor:
-        """Return the radiance (P, D) that light from the wall adds to pixels with these normals (P,
-        3) and material.
+        """Return the radiance (P, D) that the wall adds to pixels with these normals (P, 3) and
+        material.
 
         The reflected light comes from one direction, `towards`, and causes a highlight on metal.
-        Real walls and reflections are extended, so both are limited to three times the reflection
+        Since real walls and reflections are extended, it is limited to three times the reflection
         of a matte white surface.
         """
         returned = directions.new_zeros(len(normals), directions.shape[-2])
@@ -152,8 +152,9 @@ def draw_wall(
 
 
 def draw_ambient(pixels: int, share: float, generator: torch.Generator) -> Tensor:
-    """Draw ambient light (P, 1), to be scaled by the albedo: 10^U(-3.5, -1.3) for a share of the
-    pixels, else 0.
+    """Draw ambient light (P, 1), to be scaled by the albedo.
+
+    It is 10^U(-3.5, -1.3) for a share of the pixels, and 0 for the others.
     """
     present = draw_uniform(generator, pixels, 1) < share
     return 10 ** draw_uniform(generator, pixels, 1, low=-3.5, high=-1.3) * present
@@ -228,8 +229,8 @@ class PixelScene:
 
 
 def draw_visible_normals(pixels: int, generator: torch.Generator) -> Tensor:
-    """Draw unit normals (P, 3) towards the camera, uniform by projected area as on the pixels of a
-    sphere.
+    """Draw unit normals (P, 3) towards the camera, uniform by projected area, as for the pixels of
+    a sphere.
     """
     radius = 0.997 * torch.sqrt(torch.rand(pixels, generator=generator, device=generator.device))
     azimuth = 2 * torch.pi * torch.rand(pixels, generator=generator, device=generator.device)

@@ -1,10 +1,10 @@
 """Ray-mesh intersection by Embree (https://www.embree.org) through embreex, and the surface visible
 to a camera.
 
-embreex is part of the extra `render` and is imported when a Tracer is made. The camera looks along
--z at the square [-1, 1]^2, orthographic or from a finite distance. A pixel is the mean of k x k
-samples on a regular grid. One sample at the centre is not enough: on glossy metal its radiance is
-off by a tenth.
+embreex is part of the extra `render` and is imported when a Tracer is created. The camera looks
+along -z at the square [-1, 1]^2, orthographic or from a finite distance. A pixel is the mean of k x
+k samples on a regular grid. A single sample at the centre is not enough, because on glossy metal
+its radiance is wrong by a tenth.
 """
 
 from __future__ import annotations
@@ -110,8 +110,9 @@ class ShadowCache:
         self._known = np.zeros(vertices, dtype=bool)
 
     def lit(self, hits: Hits) -> NDArray[np.bool_]:
-        """Return which lights reach the vertices nearest to the surface points, (N, F). Many at a
-        time are faster.
+        """Return which lights reach the vertices nearest to the surface points, (N, F).
+
+        It is faster to pass many points at a time.
         """
         mesh = self._tracer.mesh
         nearest = np.asarray(mesh.faces[hits.triangle, hits.weights.argmax(axis=1)], dtype=np.int64)

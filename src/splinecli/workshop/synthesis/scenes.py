@@ -59,8 +59,8 @@ def render_direct(
     patch_of_face: NDArray[np.int64],
     progress: Progress = lambda _: None,
 ) -> dict[str, Tensor]:
-    """Return radiances (P, F) of each material under lights (F, 3): direct light only, with cast
-    shadows.
+    """Return radiances (P, F) of each material under lights (F, 3), with direct light and cast
+    shadows only.
     """
     pixels, directions = len(visible.normals), torch.from_numpy(lights)
     radiance = {name: torch.empty(pixels, len(lights)) for name in materials}
@@ -126,19 +126,19 @@ class _Vertices:
 
 @dataclass(frozen=True)
 class _Sharpness:
-    """How sharp the lobes of surfaces are that emit or receive indirect light."""
+    """The sharpness of the lobes of surfaces that emit or receive indirect light."""
 
-    lowest: float  # roughness
-    paths: int  # per pixel
-    lobes: tuple[float, ...]  # of the drawn directions
+    lowest: float  # lowest roughness
+    paths: int  # number of paths per pixel
+    lobes: tuple[float, ...]  # lobes of the drawn directions
 
     def soften(
         self, material: PrincipledMaterial, vertices: _Vertices, rows: slice | Tensor
     ) -> PrincipledMaterial:
-        """Return the materials of some of the vertices, softened.
+        """Return the softened materials of these vertices.
 
-        A lobe of roughness r reflects a light into about 4 pi r^4 steradians. Paths with an
-        expected number of less than one in it make a blunter lobe.
+        A lobe of roughness r reflects a light into about 4 pi r^4 steradians. If fewer than one
+        path is expected in it, the lobe is blunter.
         """
         if self.lowest >= SOFT:
             floor: float | Tensor = SOFT
@@ -172,8 +172,8 @@ def render_indirect(  # noqa: PLR0913 - the parts of a scene, and how it is trac
     """Return radiances (P, F) of each material from light that was reflected 1 to `bounces` times
     before.
 
-    `patch_of_face` (T,) gives the row of each face in the materials, `directions` the number of
-    paths per pixel.
+    `patch_of_face` (T,) contains the row of each face in the materials, and `directions` is the
+    number of paths per pixel.
     """
     pixels = len(visible.normals)
     sharpness = _Sharpness(
@@ -309,7 +309,7 @@ SHARP_LOBES = (0.0, 0.1, 0.015, 0.35)
 def draw_directions(
     normals: Tensor, back: Tensor, first: Tensor, shift: Tensor, lobes: Sequence[float] = LOBES
 ) -> tuple[Tensor, Tensor]:
-    """Draw directions (N, 3) and return them with their densities (N, 1). Some may be below the
+    """Draw directions (N, 3), and return them with their densities (N, 1). Some may be below the
     horizon.
 
     The surface normals and the directions `back` to the previous vertices of the paths are (N, 3),
@@ -452,16 +452,16 @@ def draw_scene(
     mesh: Mesh | None = None,
     reliefs: Sequence[Path] = (),
 ) -> Scene:
-    """Draw scene number `index` of the set with this seed, with the given mesh or, for None, a
-    random shape.
+    """Draw scene number `index` of the set with this seed, with the given mesh or a random shape
+    for None.
 
     Half of the scenes get a relief from one of the normal maps, if any are given; see draw_detail.
-
-    The surface has one patch in 60 % of the scenes, as real objects have one or few materials, 2 to
-    12 in 25 %, and 20 to 3,000 in 15 %. In half of the scenes the patches differ only in their base
-    colour, as on a painted or printed object of uniform gloss. A camera at a finite distance is 1 /
-    U(0.02, 0.25) halves of the frame's width away, and at least a frame's width from the shape: at
-    0.25, the frame is 28 degrees wide. Raises UsageError if the extra `render` is not installed.
+    The surface has one patch in 60 % of the scenes, because real objects have one or few materials,
+    2 to 12 in 25 %, and 20 to 3,000 in 15 %. In half of the scenes, the patches differ only in
+    their base colour, as on a painted or printed object of uniform gloss. A camera at a finite
+    distance is 1 / U(0.02, 0.25) halves of the frame's width away, and at least a frame's width
+    from the shape: at 0.25, the frame is 28 degrees wide. Raises UsageError if the extra `render`
+    is not installed.
     """
     rng = np.random.default_rng([seed, index])
     lights = draw_lights(config.lights, rng)

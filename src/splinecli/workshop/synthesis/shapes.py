@@ -45,8 +45,8 @@ def draw_shape(rng: np.random.Generator, place: float | None = None) -> tuple[st
 
     40 % are carved (warped unions of solids with pieces cut out), 20 % rough (spheres with noise),
     15 % relief (folded slabs that fill the frame), and 25 % vessels (bowls and cups that show their
-    inside to the camera). `place`, from 0 to 1, determines the kind: evenly spread values give a
-    set the right share of each. Raises UsageError if the extra `render` is not installed.
+    inside to the camera). `place`, from 0 to 1, determines the kind, so that evenly spread values
+    give a set the right share of each. Raises UsageError if the extra `render` is not installed.
     """
     place = rng.random() if place is None else place
     name = list(KINDS)[int(np.searchsorted(np.cumsum((0.4, 0.2, 0.15)), place, side="right"))]
@@ -93,8 +93,9 @@ def draw_view(mesh: Mesh, others: Sequence[Path], rng: np.random.Generator) -> M
 
 
 def magnified(mesh: Mesh, rng: np.random.Generator) -> Mesh:
-    """Return the mesh or, in half of the cases, a part of it: enlarged by U(1, 2.2) around a point
-    on the surface.
+    """Return the mesh or, in half of the cases, a part of it.
+
+    The part is magnified by U(1, 2.2) around a point on the surface.
     """
     if rng.random() >= 0.5:
         return mesh
@@ -106,8 +107,9 @@ def magnified(mesh: Mesh, rng: np.random.Generator) -> Mesh:
 
 
 def _touching(mesh: Mesh, other: Mesh, rng: np.random.Generator) -> Mesh:
-    """Return both meshes, the other one scaled down and moved in a random direction to overlap by
-    40 % at most.
+    """Return both meshes, the other one scaled down and moved in a random direction.
+
+    They overlap by at most 40 %.
     """
     direction = rng.normal(size=3) * np.array((1, 1, 0.5))
     direction /= np.linalg.norm(direction)
@@ -122,7 +124,7 @@ def _touching(mesh: Mesh, other: Mesh, rng: np.random.Generator) -> Mesh:
 
 
 def joined(mesh: Mesh, other: Mesh, vertices: Floats) -> Mesh:
-    """Return both meshes as one, with other vertices for the second."""
+    """Return both meshes as one mesh with separate vertices."""
     return Mesh(
         np.concatenate((mesh.vertices, vertices)).astype(np.float32),
         np.concatenate((mesh.faces, other.faces + len(mesh.vertices))).astype(np.int32),
@@ -162,8 +164,8 @@ def draw_waves(
     outputs: int = 1,
     ridged: bool = False,
 ) -> meshes.Field:
-    """Draw smooth or ridged noise with a frequency in cycles per unit length, and a height by its
-    mean slope.
+    """Draw smooth or ridged noise with a frequency in cycles per unit length and a given mean
+    slope.
     """
     frequency = rng.uniform(*frequencies)
     height = np.float32(rng.uniform(*slopes) / ((4 if ridged else 2) * np.pi * frequency))
@@ -323,12 +325,12 @@ _STEEPEST = 4.0  # largest slope read from a normal map
 
 
 def read_relief(path: Path) -> Floats:
-    """Read a tileable normal map, RGB = (n + 1) / 2, as the slopes (h, w, 2) of its height along
-    its columns and rows.
+    """Return the slopes (h, w, 2) of a relief along its columns and rows, from a tileable normal
+    map.
 
-    The direction of green, up or down, is inferred from the slopes, because the slopes of a surface
-    have no curl. The vectors need not have unit length. Raises InputError if the file is not a
-    colour image.
+    The map is RGB = (n + 1) / 2. The direction of green, up or down, is inferred from the slopes,
+    because the slopes of a surface have no curl. The vectors need not have unit length. Raises
+    InputError if the file is not a colour image.
     """
     normals = 2 * read_image(path) - 1
     if normals.shape[2] != 3:

@@ -1,13 +1,14 @@
 """Simulation of whole captures, with a background behind the object, a camera, and faults common to
 all pixels.
 
-Rendered scenes have little pixel-scale curvature. Engraved pieces do, which are plates and half
-ellipsoids, smooth or with detail of a few pixels, but without cast shadows or interreflection.
+Rendered scenes have little curvature at the scale of pixels. Engraved pieces do: they are plates
+and half ellipsoids, smooth or with detail of a few pixels, but without cast shadows or
+interreflection.
 
-The camera between the object and the files has a lens, a Bayer pattern, sharpening and JPEG. These
-effects and translucent materials mix neighbouring pixels, so they act on whole images (F, H, W) of
-linear radiance, background included. Each draw documents its distribution. Faults that affect each
-pixel separately are in batches.py.
+Between the object and the files, the camera has a lens, a Bayer pattern, sharpening and JPEG. These
+effects and translucent materials mix neighbouring pixels, so they apply to whole images (F, H, W)
+of linear radiance, including the background. Each draw documents its distribution. Faults that
+affect pixels separately are in batches.py.
 """
 
 from __future__ import annotations
@@ -138,8 +139,8 @@ def scatter(maps: Tensor, mask: Tensor, generator: torch.Generator) -> Tensor:
     """Return radiance (F, H, W) of an object (H, W) whose material scatters light below its
     surface.
 
-    A share U(0.3, 1) of the light leaves the surface at a distance from its point of entry: a
-    Gaussian with a sigma of U(1, 4) pixels. Light does not scatter out of the object.
+    A share U(0.3, 1) of the light leaves the surface at a distance from its point of entry, with a
+    Gaussian distribution of sigma U(1, 4) pixels. Light is not scattered out of the object.
     """
     share, kernel = draw_number(generator, 0.3, 1), gaussian_kernel(draw_number(generator, 1, 4))
     inside = mask[None].float()
@@ -161,17 +162,17 @@ def _blurred(images: Tensor, kernel: Tensor) -> Tensor:
 def draw_engraved(
     size: int, lights: Tensor, generator: torch.Generator, *, round_share: float = 1 / 3
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Draw a piece; return its unit normals (P, 3), its radiance (P, F), and its mask (size, size)
-    with P true pixels.
+    """Draw a piece, and return its unit normals (P, 3), its radiance (P, F), and its mask (size,
+    size).
 
     `round_share` of the pieces are half ellipsoids, whose mask ends at their rim. The others are
     plates that fill the frame: tilted by a slope of up to 0.7, with three waves of U(0.3, 2) frames
     and slopes of up to 0.3. Each piece has one kind of detail: grooves U(1, 6) pixels wide to
     either side, regular or not, straight or curved; facets of 3 to 20 pixels; or a random texture
-    with a grain of U(0.4, 1.5) pixels. The slopes of the detail are about U(0.05, 0.6), a third as
-    large for the texture. A third of the pieces are smooth. The material comes from draw_material,
-    with 1 to 300 patches; in half of the pieces, the patches differ only in their base colour. The
-    lights (F, 3) are unit.
+    with a grain of U(0.4, 1.5) pixels. The slopes of the detail are about U(0.05, 0.6), and a third
+    of this for the texture. A third of the pieces are smooth. The material comes from
+    draw_material, with 1 to 300 patches; in half of the pieces, the patches differ only in their
+    base colour. The lights (F, 3) are unit, and the mask has P true pixels.
     """
     uniform = partial(draw_number, generator)
     normals, mask = _draw_base(size, round_share, generator)
@@ -192,8 +193,8 @@ def draw_engraved(
 
 
 def _draw_base(size: int, round_share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Draw a half ellipsoid or a plate; return its unit normals (size^2,
-    3) and its mask (size^2,).
+    """Draw a half ellipsoid or a plate, and return its unit normals (size^2, 3) and its mask
+    (size^2,).
     """
     uniform = partial(draw_number, generator)
     places = _places(size)
@@ -277,11 +278,10 @@ def photograph_captures(
     config: CaptureConfig,
     generator: torch.Generator,
 ) -> PixelBatch:
-    """Photograph pixels of the G captures set by the configuration; pixel p belongs to capture p %
-    G.
+    """Photograph the pixels of G captures. Pixel p belongs to capture p % G.
 
-    See `photograph_scene` for the arguments. All pixels of a capture have the same directions,
-    valid ones first.
+    For the arguments, see `photograph_scene`. The configuration determines G. All pixels of a
+    capture have the same directions, valid ones first.
     """
     if config.capture_pixels == 1:
         return batches.photograph(truth, radiance, directions, valid, config, generator)
@@ -410,11 +410,11 @@ def photograph_scene(  # noqa: PLR0915 - one fault after the other, as in a came
 
 
 def _ambient(radiance: Tensor, share: float, uniform: Callable[..., float]) -> Tensor:
-    """Draw the ambient light (P, 1) of radiance (P, F): none, or a mixture of the two kinds in
-    `photograph_scene`.
+    """Draw the ambient light (P, 1) of radiance (P, F).
 
-    Light transport is linear, so the mean over the lights is the radiance in a uniformly bright
-    room. It is about half of the albedo, so the levels match draw_ambient in pixels.py.
+    There is none, or a mixture of the two kinds in `photograph_scene`. Light transport is linear,
+    so the mean over the lights is the radiance in a uniformly bright room. It is about half of the
+    albedo, so the levels match draw_ambient in pixels.py.
     """
     level = 10 ** uniform(-3.2, -1.0) * (uniform() < share)
     return level * torch.lerp(radiance.mean(dim=1, keepdim=True), radiance.mean(), uniform())
@@ -423,12 +423,12 @@ def _ambient(radiance: Tensor, share: float, uniform: Callable[..., float]) -> T
 def add_background(
     maps: Tensor, mask: Tensor, lights: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Put a background behind an object; return its maps (F + 3, h, w) and a mask (h, w) that
-    includes some background.
+    """Add a background behind an object, and return maps (F + 3, h, w) and a mask (h, w).
 
-    Real masks may include more than the object, and captures may have no mask. The maps of the
-    object are radiance (F, H, W) and unit normals (3, H, W), under unit lights (F, 3). The returned
-    maps have zero for unknown normals: in darkness, and under uneven light.
+    The mask includes some background, because real masks may include more than the object, and
+    captures may have no mask. The maps of the object are radiance (F, H, W) and unit normals (3, H,
+    W), under unit lights (F, 3). In the returned maps, normals are zero where they are unknown: in
+    darkness, and under uneven light.
 
     A third of the backgrounds are nearly dark. The others are plates from draw_engraved in the
     shadow of the object, at a distance of up to half its size. Half of the plates are lit unevenly,

@@ -1,6 +1,4 @@
-"""The settings of a training run in one frozen record, from presets by name, files and single
-settings.
-"""
+"""The settings of a training run as one frozen record, from presets, files and single settings."""
 
 from __future__ import annotations
 
@@ -265,10 +263,10 @@ def read_config_file(path: Path) -> Settings:
 
 
 def parse_parameter(text: str) -> Settings:
-    """Parse one setting: "a.b=value" gives {"a": {"b": value}}.
+    """Return a setting as nested values: "a.b=value" becomes {"a": {"b": value}}.
 
-    The value is read as TOML. A value that is not TOML is taken as text. Raises UsageError if there
-    is no name or no "=".
+    The value is read as TOML, or as text if it is not valid TOML. Raises UsageError if there is no
+    name or no "=".
     """
     name, equals, value = text.partition("=")
     keys = [key.strip() for key in name.split(".")]
@@ -285,9 +283,9 @@ def parse_parameter(text: str) -> Settings:
 
 
 def parse_sources(sets: Sequence[Path], generator_weight: float | None) -> dict[str, float]:
-    """Return the weights of the sources: 1 for each set, and the generator's.
+    """Return the weights of the sources: 1 for each set, and the weight of the generator.
 
-    Without `generator_weight`, the generator has weight 0 if there are sets, else 1.
+    By default, the generator has weight 0 if there are sets, and 1 otherwise.
     """
     weights = {str(path): 1.0 for path in sets}
     if generator_weight is None:
@@ -302,12 +300,12 @@ def configure(
     *,
     base: TrainingConfig | None = None,
 ) -> TrainingConfig:
-    """Return a preset, changed by the settings of a file and then by `changes`, in their order.
+    """Return a preset, changed by the settings of a file and then by `changes`, in this order.
 
-    A table of sources is replaced as a whole. Other tables are merged key by key. Without a name of
-    a preset, the file's entry "preset" counts, or else `base`, which is DEFAULT_PRESET for None.
+    A table of sources is replaced as a whole. Other tables are merged key by key. If no preset is
+    named, the entry "preset" in the file is used, or `base`, which is DEFAULT_PRESET for None.
     Raises UsageError if there is no such preset, or ModelError if a setting is unknown or its value
-    is not allowed. The message names the file it is in.
+    is not allowed. The message names the file that contains it.
     """
     given = read_config_file(file) if file else {}
     named = given.pop("preset", DEFAULT_PRESET if base is None else None)
@@ -338,7 +336,7 @@ def configure(
 
 
 def check_resumable(started: TrainingConfig, asked: TrainingConfig, path: Path) -> None:
-    """Raise ModelError, with the path of the checkpoint, for a setting that differs and is not in
+    """Raise ModelError, with the path of the checkpoint, if a setting differs and is not in
     CHANGEABLE.
     """
     old, new = _flat(started.to_dict()), _flat(asked.to_dict())

@@ -1,8 +1,8 @@
-"""The training loop: it draws batches, updates LI-Net and NE-Net together or in turn, and saves the
-run.
+"""The training loop, which draws batches, updates LI-Net and NE-Net together or in turn, and saves
+the run.
 
 A run starts or continues in a folder, with one process or with all processes of torchrun. After
-each backward pass the processes average their gradients in one message, with gloo on CPUs and NCCL
+each backward pass, the processes average their gradients in one message, with gloo on CPUs and NCCL
 on GPUs. Every process then computes the same update of the same weights. The only other data
 exchanged is the training time of the first process.
 """
@@ -50,8 +50,9 @@ from splinecli.workshop.training.tasks import DROPOUT_STREAM, PixelTask, Refinem
 
 @dataclass(frozen=True)
 class Workers:
-    """The rank of this process among `count` processes. Rank 0 leads: only it writes files and
-    keeps the time.
+    """The rank of this process among `count` processes. The process of rank 0 is the leader.
+
+    Only the leader writes files and keeps the time.
     """
 
     rank: int = 0
@@ -63,8 +64,9 @@ class Workers:
         return self.rank == 0
 
     def shards(self, total: int) -> range:
-        """Return the shards of a batch for this process. Raises UsageError if they cannot be shared
-        evenly.
+        """Return the shards of a batch for this process.
+
+        Raises UsageError if they cannot be shared evenly.
         """
         if total % self.count:
             raise UsageError(
@@ -96,7 +98,7 @@ class Workers:
         return numbers_averaged.to(numbers)
 
     def agree(self, value: float, device: torch.device) -> float:
-        """Return the value of the first process, for all processes."""
+        """Return the value of the first process in all processes."""
         if self.count == 1:
             return value
         shared = torch.tensor([value], dtype=torch.float64, device=device)
@@ -128,8 +130,8 @@ def restarts_are_allowed() -> bool:
 
 
 def join_workers(device: torch.device) -> tuple[Workers, torch.device]:
-    """Join the other processes, if torchrun started any; return the rank of this process and its
-    device.
+    """Join the other processes if torchrun started any, and return the rank and device of this
+    process.
     """
     if "TORCHELASTIC_RUN_ID" not in os.environ and int(os.environ.get("WORLD_SIZE", "1")) <= 1:
         return Workers(), device
@@ -170,11 +172,10 @@ def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
 
 
 def start_network(weights: str, network: SplineNet) -> None:
-    """Copy the weights into the network, which may have an error head, refinement nets or context
-    that they lack.
+    """Copy weights into the network, which may have additional parts.
 
-    Refinement nets may also be larger than those of the weights. Their result is initially the
-    same.
+    These may be an error head, refinement nets or context. Refinement nets may also be larger than
+    those of the weights; initially, their result is the same.
     """
     loaded = resolve_weights(weights).network
     wanted, found = network.config.to_dict(), loaded.config.to_dict()
@@ -210,15 +211,15 @@ def start_network(weights: str, network: SplineNet) -> None:
 
 
 def _covers(wanted: Any, found: Any) -> bool:
-    """Return whether a setting of the refinement nets, a number or several, is nowhere smaller than
-    another one.
+    """Return whether a setting of the refinement nets (one or several numbers) is at least another
+    one.
     """
     return all(one >= other for one, other in zip(np.ravel(wanted), np.ravel(found), strict=True))
 
 
 def enlarged(values: Tensor, initial: Tensor) -> Tensor:
-    """Return the initial weights of a layer (D, C, ...) that is at least as large as another one,
-    which it contains.
+    """Return the initial weights of a layer (D, C, ...) that contains another, at most equally
+    large layer.
 
     The outputs of the other layer do not depend on the added inputs.
     """
@@ -300,12 +301,11 @@ class Trainer:
         return min(1.0, self.counters.step / self.config.steps)
 
     def run(self, report: Callable[[float, Metrics], None] | None = None) -> Metrics | None:
-        """Train to the end, saving regularly, and return the last metrics on the leader. A finished
-        run is left alone.
+        """Train to the end, saving regularly, and return the last metrics on the leader.
 
-        `report` is called with progress and metrics at each entry of the log. Raises ModelError if
-        the loss or its gradient is no longer finite; the last checkpoint stays. Raises OutputError
-        if a file cannot be written.
+        A finished run is not changed. `report` is called with progress and metrics at each entry of
+        the log. Raises ModelError if the loss or its gradient is no longer finite, in which case
+        the last checkpoint remains. Raises OutputError if a file cannot be written.
         """
         metrics = None
         losses: dict[Part, list[Tensor]] = {}
@@ -337,7 +337,7 @@ class Trainer:
         return metrics
 
     def step(self) -> Tensor:
-        """Update once on a new batch; return the losses (6,), as in Losses, averaged over all
+        """Update once on a new batch, and return the losses (6,), as in Losses, averaged over all
         processes.
         """
         config = self.config
@@ -375,10 +375,10 @@ class Trainer:
         return numbers
 
     def save(self) -> None:
-        """Write averaged weights, pictures and checkpoint. Raises OutputError.
+        """Write averaged weights, pictures and the checkpoint. Raises OutputError.
 
-        The checkpoint comes last: a run killed before that point repeats the steps and rewrites the
-        other files.
+        The checkpoint comes last, so a run that is killed before that repeats the steps and
+        rewrites the other files.
         """
         save_weights(self.average, self.folder / WEIGHTS)
         self.log.draw(self.task.sample_maps(self.average))
@@ -426,11 +426,11 @@ def configure_run(
     *,
     resume: bool,
 ) -> tuple[TrainingConfig, bool]:
-    """Return the configuration of a run, and whether it continues. Raises ModelError, UsageError.
+    """Return the configuration of a run, and whether it continues an earlier one.
 
-    A run continues on request, or after torchrun has restarted its processes: with --max-restarts,
-    one command both starts a run and continues it. Without a preset, settings that are not given
-    keep the values of the continued run.
+    A run continues on request, or after torchrun has restarted its processes, so that with
+    --max-restarts, one command both starts a run and continues it. Without a preset, settings that
+    are not given keep the values of the continued run. Raises ModelError or UsageError.
     """
     if not (resume or (restarts_are_allowed() and (folder / CHECKPOINT).exists())):
         return configure(preset_name, file, changes), False
@@ -450,15 +450,13 @@ def open_run(
     tensorboard: bool,
     observer: Observer,
 ) -> Iterator[Trainer]:
-    """Join the other processes, lock the folder and yield the trainer of a run that `configure_run`
-    has configured.
+    """Join the other processes, lock the folder and yield the trainer of a configured run.
 
-    The observer receives messages about files left by a killed process and about a slow start.
-
-    Raises UsageError if the processes cannot share a batch, the device is not available, or
-    TensorBoard is not installed; ModelError if the checkpoint does not fit, or the initial weights
-    cannot be used; InputError if a pixel set cannot be used; OutputError if the folder cannot be
-    written, or has a run in it and `resume` is not set.
+    The configuration is from `configure_run`. The observer receives messages about files left by a
+    killed process and about a slow start. Raises UsageError if the processes cannot share a batch,
+    the device is not available, or TensorBoard is not installed; ModelError if the checkpoint does
+    not fit, or the initial weights cannot be used; InputError if a pixel set cannot be used;
+    OutputError if the folder cannot be written, or contains a run and `resume` is not set.
     """
     check_writable(folder)
     use_available_cores()

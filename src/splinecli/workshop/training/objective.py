@@ -1,9 +1,9 @@
 """The losses of SPLINE-Net (Zheng et al., ICCV 2019, section 3), for both networks or for one while
 the other is fixed.
 
-Every loss is the mean of one number per pixel. The loss of a batch is therefore the mean of the
-losses of its equal parts. The paper does not specify whether |.| is a sum or an average over the
-cells of a map; the argument `norm` does.
+Every loss is the mean of one number per pixel, so the loss of a batch is the mean of the losses of
+its equal parts. The paper does not specify whether |.| is a sum or an average over the cells of a
+map; the argument `norm` selects one.
 """
 
 import math
@@ -42,7 +42,7 @@ class Losses(NamedTuple):
 
 
 def part_of_step(config: TrainingConfig, step: int) -> Part:
-    """Return which networks are updated in a step."""
+    """Return the networks that are updated in a step."""
     if config.updates == "joint":
         return "both"
     if config.updates in ("error_head", "refine_net"):
@@ -145,8 +145,8 @@ def _special(
 
 
 def dense_truth_in_frame(batch: PixelBatch, maps: PixelMaps, *, size: int) -> DenseMap:
-    """Return D_gt in the pixels' frames, at the scale of the sparse maps, with values above 1 cut
-    off.
+    """Return D_gt in the pixels' frames, at the scale of the sparse maps, with values clipped at
+    1.
     """
     dense = batch.truth.rotate(maps.cosine, maps.sine).dense_truth(size)
     values = (dense.values * (batch.exposure / maps.scale)[..., None, None]).clamp(max=1)
@@ -158,7 +158,7 @@ def dense_truth_in_frame(batch: PixelBatch, maps: PixelMaps, *, size: int) -> De
 
 @contextmanager
 def fixed(network: SplineNet, part: Part) -> Iterator[None]:
-    """Compute no gradients for parameters outside `part`. Gradients still propagate through
+    """Disable the gradients of parameters outside `part`. Gradients still propagate through
     them.
     """
     inside = {
@@ -196,8 +196,8 @@ def balanced(error: Tensor, reference: Tensor | None = None) -> Tensor:
     """Return the mean error of captures (G,) in radians, each divided by the square root of its
     reference.
 
-    An error of one degree thus has more weight in a capture that is already accurate. The reference
-    (G,), by default `error`, measures the difficulty of each capture.
+    Therefore, an error of one degree has more weight in a capture that is already accurate. The
+    reference (G,), by default `error`, indicates how difficult each capture is.
     """
     reference = error.detach() if reference is None else reference
     # Without this offset, captures that are already accurate would have too much weight.
@@ -206,24 +206,22 @@ def balanced(error: Tensor, reference: Tensor | None = None) -> Tensor:
 
 
 def map_loss(dense: Tensor, truth: Tensor, cells: Tensor, norm: Norm = "mean") -> Tensor:
-    """Return |D - D_gt| over the given cells, or |M_s o (D - D_gt)| over cells of the sparse map:
-    average or sum.
+    """Return |D - D_gt| over the given cells, or |M_s o (D - D_gt)| over cells of the sparse map.
 
-    LI-Net's maps D and the true maps D_gt are (P, 1, w, w). `cells` is 1 in the cells to include,
-    whose true value must be known, else 0.
+    It is averaged or summed. LI-Net's maps D and the true maps D_gt are (P, 1, w, w). `cells` is 1
+    in the cells to include, whose true value must be known, and 0 elsewhere.
     """
     total = ((dense - truth).abs() * cells).sum((1, 2, 3))
     return (total if norm == "sum" else total / cells.sum((1, 2, 3)).clamp(min=1)).mean()
 
 
 def mirror(maps: Tensor, normals: Tensor) -> Tensor:
-    """Return r(D, n): maps (P, C, w, w) mirrored about the axis through the centre and projected
-    unit normals (P, 3).
+    """Return r(D, n): maps (P, C, w, w), mirrored about the axis through the centre and the normal.
 
-    The map of an isotropic pixel without cast shadows is its own mirror image. Values between cells
-    are interpolated, so that the result has a gradient with respect to the normal as well as the
-    map. A normal towards the camera has no azimuth. Its map is rotated by 180 degrees, which is
-    also a symmetry.
+    The axis is given by the projections of unit normals (P, 3). The map of an isotropic pixel
+    without cast shadows is its own mirror image. Values between cells are interpolated, so that the
+    result has a gradient with respect to both the normal and the map. A normal towards the camera
+    has no azimuth. Its map is rotated by 180 degrees, which is also a symmetry.
     """
     size = maps.shape[-1]
     centre = (torch.arange(size, device=maps.device, dtype=maps.dtype) + 0.5) * (2 / size) - 1
@@ -238,13 +236,12 @@ def mirror(maps: Tensor, normals: Tensor) -> Tensor:
 
 
 def asymmetries(dense: Tensor, normals: Tensor, filled: Tensor) -> tuple[Tensor, Tensor]:
-    """Return |D - r(D, n)| and |p(D) - p(r(D, n))|, each summed over the cells of a pixel: (P,) and
-    (P,).
+    """Return |D - r(D, n)| and |p(D) - p(r(D, n))|, each summed over the cells of a pixel, (P,).
 
     The mean of the first is Ls, the loss for isotropic reflectance. p is average pooling with
-    stride 2. Maps D and `filled`, 1 in cells with a value, else 0, are (P, 1, w, w); normals are
-    (P, 3), unit. Only filled cells with a filled mirror image are compared. Near the rim and beside
-    gaps, a mirrored value would be partly interpolated from empty cells.
+    stride 2. Maps D and `filled`, 1 in cells with a value and 0 elsewhere, are (P, 1, w, w);
+    normals are (P, 3), unit. Only filled cells with a filled mirror image are compared, because
+    near the rim and next to gaps, a mirrored value would be partly interpolated from empty cells.
     """
     image, image_filled = torch.chunk(mirror(torch.cat((dense, filled), dim=1), normals), 2, dim=1)
     both = filled * (image_filled > 0.999)
@@ -264,8 +261,9 @@ def asymmetric_loss(fine: Tensor, coarse: Tensor, *, eta: float, lambda_c: float
 
 
 def error_negative_log_likelihood(error: Tensor, angle: Tensor) -> Tensor:
-    """Return the negative log-likelihood (P,) of the logs of errors (P,), in radians, under
-    distributions (P, 2).
+    """Return the negative log-likelihood (P,) of the logarithms of errors (P,) in radians.
+
+    The distributions are (P, 2).
     """
     median, shape = error.unbind(-1)
     z = shape.exp() * ((angle + math.radians(MORE_DEG)).log() - median)

@@ -74,10 +74,9 @@ class Scene(NamedTuple):
 class ScenePool:
     """Captures of scenes, each with its own lights and faults. The pool grows during training.
 
-    A capture depends only on (seed, its number). The scenes are pixel sets with some of their
-    entries, and the weight of each set; the network has an error head and is on the device of the
-    captures. A resumed run begins with its newest captures, of which `first` is the number of the
-    first.
+    A capture depends only on (seed, its number). The scenes are pixel sets with selected entries,
+    and the weight of each set; the network has an error head and is on the device of the captures.
+    A resumed run starts with its newest captures, of which `first` is the number of the first.
     """
 
     def __init__(
@@ -163,7 +162,9 @@ class ScenePool:
         return SceneMaps(_placed(features, mask).half(), _placed(truth, mask).half(), mask[None])
 
     def draw(self, count: int, generator: torch.Generator) -> SceneMaps:
-        """Draw `count` captures, rotate and mirror each, and stack them as float32 (count, ...)."""
+        """Draw `count` captures, rotate and mirror each, and return them stacked as float32 (count,
+        ...).
+        """
         drawn = []
         for index in torch.randint(
             len(self.examples), (count,), generator=generator, device=generator.device
@@ -187,11 +188,10 @@ def _placed(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def _enlarged(maps: Tensor, mask: Tensor, scale: float) -> tuple[Tensor, Tensor]:
-    """Return maps (C, H, W) and their mask, enlarged by bilinear interpolation between pixels of
-    the mask.
+    """Return maps (C, H, W) and their mask, enlarged by bilinear interpolation inside the mask.
 
-    A scene is rendered at low resolution, so its normals change considerably between adjacent
-    pixels. A photograph of a real object has more pixels, and adjacent normals are more similar.
+    Scenes are rendered at low resolution, so normals change considerably between adjacent pixels. A
+    photograph of a real object has more pixels, and adjacent normals are more similar.
     """
     if scale == 1:
         return maps, mask
@@ -209,7 +209,7 @@ def pixel_features(
     *,
     removed_blur: float | None = None,
 ) -> Tensor:
-    """Return the refinement net's features (P, FEATURE_CHANNELS) of the pixels of a mask (H, W).
+    """Return the refinement net's features (P, FEATURE_CHANNELS) for the pixels of a mask (H, W).
 
     They are the same as at inference in float32.
     """
@@ -240,7 +240,7 @@ def pixel_features(
 
 
 def stack_maps(captures: Sequence[SceneMaps]) -> SceneMaps:
-    """Stack captures as float32 (B, ...); smaller ones get a margin outside the mask."""
+    """Return captures stacked as float32 (B, ...). Smaller ones get a margin outside the mask."""
     height, width = (max(capture.mask.shape[axis] for capture in captures) for axis in (-2, -1))
     return SceneMaps(
         *(
@@ -256,7 +256,7 @@ def stack_maps(captures: Sequence[SceneMaps]) -> SceneMaps:
 
 
 class RefinementLosses(NamedTuple):
-    """The total loss, and the mean angle in radians before and after refinement, averaged over
+    """The total loss, and the mean angles in radians before and after refinement, averaged over
     captures.
     """
 
@@ -273,15 +273,15 @@ def refinement_losses(
     edge_weight: float = 0.0,
     bfloat16: bool = False,
 ) -> RefinementLosses:
-    """Compute the losses of stacked captures.
+    """Return the losses of stacked captures.
 
     The error of each capture is its mean angle, in which a pixel at an edge has a weight of 1 plus
-    `edge_weight` times the largest difference of its true normal to a neighbour's; plus
+    `edge_weight` times the largest difference between its true normal and a neighbour's; plus
     `detail_weight` times the mean error of the differences between neighbours. Wrong lights rotate
-    all normals of a surface alike. This masks the sharpness of the detail in the angles, but not in
-    these differences. The error is divided by the square root of the capture's mean angle before
-    refinement, so a degree has more weight in a capture that is already accurate. The likelihood of
-    the errors is the same as for the error head.
+    all normals of a surface in the same way, which hides the sharpness of detail in the angles, but
+    not in these differences. The error is divided by the square root of the capture's mean angle
+    before refinement, so a degree has more weight in a capture that is already accurate. The
+    likelihood of the errors is the same as for the error head.
     """
     assert network.refine_net is not None, "TrainingConfig asks for a refinement net"
     with torch.autocast(maps.features.device.type, dtype=torch.bfloat16, enabled=bfloat16):
@@ -319,7 +319,7 @@ def refinement_losses(
 
 
 def _largest_step(normals: Tensor, known: Tensor) -> Tensor:
-    """Return the largest difference (B, H, W) of each normal (B, 3, H, W) to those of its known
+    """Return the largest difference (B, H, W) between each normal (B, 3, H, W) and its known
     neighbours.
     """
     largest = torch.zeros_like(normals[:, 0])

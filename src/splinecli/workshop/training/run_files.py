@@ -1,10 +1,10 @@
 """The files of a run: its log (metrics.csv, curves.png, maps.png, TensorBoard's event files) and
 its checkpoints.
 
-A checkpoint is one safetensors file from which a run continues where it stopped. It contains no
-random generator state, because the draws of a step depend only on the seed and the step number. A
-resumed run of the refinement net simulates its newest captures again and continues without the
-earlier ones.
+A checkpoint is one safetensors file from which a run continues where it stopped. It does not
+contain the state of random generators, because the draws of a step depend only on the seed and the
+number of the step. A resumed run of the refinement net simulates its newest captures again and
+continues without the earlier ones.
 """
 
 import csv
@@ -39,8 +39,8 @@ from splinecli.workshop.training.tasks import SampleMaps
 
 @dataclass(frozen=True)
 class Metrics:
-    """One line of metrics.csv: means over the steps since the previous line. A value that was not
-    computed is None.
+    """A line of metrics.csv: means over the steps since the previous line. None if a value was not
+    computed.
     """
 
     step: int  # number of updates so far
@@ -64,7 +64,7 @@ _HEADER = ",".join(field.name for field in fields(Metrics))
 
 
 class RunLog:
-    """Writer of the log files in `folder`. Its methods raise OutputError if a file cannot be
+    """Writes the log files in `folder`. Its methods raise OutputError if a file cannot be
     written.
     """
 
@@ -129,7 +129,7 @@ def none_for_nan(value: float) -> float | None:
 
 
 def _parse(line: str) -> Metrics:
-    """Return the numbers of a line. Raises ValueError for a damaged one."""
+    """Return the numbers in a line. Raises ValueError if it is damaged."""
     row = dict(zip(_HEADER.split(","), line.split(","), strict=True))
     values: dict[str, Any] = {key: float(value) if value else None for key, value in row.items()}
     return Metrics(**{**values, "step": int(row["step"]), "pixels": int(row["pixels"])})
@@ -157,8 +157,9 @@ def _drop_lines_after(step: int, path: Path) -> Path | None:
 
 
 def _lines_until(step: int, path: Path) -> list[str]:
-    """Return the lines up to a step, without the last one if a full disk has cut it. Raises
-    ValueError.
+    """Return the lines up to a step, without the last one if it was truncated by a full disk.
+
+    Raises ValueError.
     """
     if not path.exists():
         return []
@@ -198,10 +199,9 @@ def save_checkpoint(
     counters: RunCounters,
     sets: dict[str, str],
 ) -> None:
-    """Write the complete state of a run, with the running average of the weights and the SHA-256 of
-    each pixel set.
+    """Write the complete state of a run. Raises OutputError.
 
-    Raises OutputError.
+    It includes the running average of the weights and the SHA-256 of each pixel set.
     """
     tensors: dict[str, Tensor] = {}
     for prefix, module in (("network", network), ("average", average)):
@@ -239,7 +239,7 @@ def load_checkpoint(
     """Restore networks and optimiser from a checkpoint, in place, and return the counters of the
     run.
 
-    Raises ModelError if the file is missing, damaged or from another network, or a pixel set has
+    Raises ModelError if the file is missing, damaged or from another network, or if a pixel set has
     changed.
     """
     tensors, metadata = _read(path)

@@ -68,9 +68,9 @@ class MixedSource:
 def split_scenes(entries: Sequence[Entry], share: float) -> tuple[list[Entry], list[Entry]]:
     """Split the entries of a set into training and validation entries, scene by scene.
 
-    The scenes whose names have the lowest hashes are used for validation, so the choice for one
-    scene hardly depends on the other scenes of the set. A share above 0 selects at least one scene,
-    and always leaves one for training.
+    The scenes whose names have the lowest hashes are used for validation, so the choice of a scene
+    hardly depends on the other scenes of the set. A share above 0 selects at least one scene, and
+    always leaves one for training.
     """
     scenes = sorted(
         {entry.scene for entry in entries},
@@ -181,7 +181,7 @@ class SampleMaps(NamedTuple):
 
 
 class PixelTask:
-    """Batches of pixels from the sources of a run: `source` for training, and the sources for
+    """Batches of pixels from the sources of a run: `source` for training, and other sources for
     `validation`.
     """
 
@@ -210,8 +210,8 @@ class PixelTask:
     def draw(self, step: int) -> tuple[list[tuple[PixelBatch, Tensor]], bool]:
         """Draw this process's shards of a step's batch.
 
-        Returns each shard's pixels and their additional rotations in degrees (P,), and whether all
-        are mirrored.
+        Returns the pixels of each shard, their additional rotations in degrees (P,), and whether
+        all are mirrored.
         """
         config = self.config
         canonical = config.network.is_canonical
@@ -288,8 +288,8 @@ def _sample(network: SplineNet, batch: PixelBatch, count: int) -> SampleMaps:
 def _estimate(
     network: SplineNet, batch: PixelBatch, *, bfloat16: bool = False
 ) -> tuple[PixelMaps, Tensor | None, Tensor]:
-    """Return the networks' input, LI-Net's dense maps and NE-Net's normals,
-    in the pixels' frames.
+    """Return the networks' input, LI-Net's dense maps and NE-Net's normals, in the pixels'
+    frames.
     """
     network.eval()
     maps = network.build_maps(batch.observations, batch.light_directions, batch.valid)
