@@ -79,7 +79,7 @@ def test_several_evaluations_begin_with_their_averages():
     assert "Notes" not in headings
     assert "Figures" not in headings
     assert "4 or 1" in page.text["dd"]  # trials
-    assert any("one trial: not tested" in words for words in page.text["li"])
+    assert any("(not tested, one trial)" in words for words in page.text["li"])
     assert page.text["li"].count(": bear: no images.") == 1
 
 

@@ -94,7 +94,8 @@ def test_a_draws_file_that_does_not_fit_a_capture(write_dome, tmp_path):
     evaluation = evaluate(folders, LS, protocol)
     assert evaluation.captures == ("ten",)
     problem = (
-        f"{tmp_path}/draws.txt:2: found light index 9, expected 0 to 7: the capture has 8 lights."
+        f"{tmp_path}/draws.txt:2: found light index 9, expected 0 to 7, because the capture has 8"
+        " lights."
     )
     assert [(s.capture, s.reason) for s in evaluation.skipped] == [("eight", problem)]
 
@@ -143,8 +144,8 @@ def test_captures_that_cannot_be_scored_are_skipped(write_dome, tmp_path):
 def test_nothing_scored_is_an_error(write_dome, tmp_path):
     untrue, few = write_dome("untrue", ground_truth=False), write_dome("few", n_lights=4)
     none = (
-        "none of the 2 captures could be scored; the first: .*untrue: the capture has no ground"
-        " truth"
+        "none of the 2 captures could be scored; the first error is: .*untrue: the capture has no"
+        " ground truth"
     )
     for folders, error, message in (
         ([untrue, few], InputError, none),
@@ -307,5 +308,5 @@ def test_draws_keep_to_the_images_that_are_not_left_out(write_dome, tmp_path):
     seen = {tuple(light) for draw in fake.lights for light in draw}
     assert seen == {tuple(light) for light in lights[3:]}
     (tmp_path / "draws.txt").write_text("3 4 5\n2 4 5\n")
-    with pytest.raises(InputError, match=r"draws\.txt:2: found light index 2; the first 3 images"):
+    with pytest.raises(InputError, match=r"draws\.txt:2: found light index 2, but the first 3"):
         evaluate([folder], [fake], Protocol(draws_file=tmp_path / "draws.txt", skip_first={"*": 3}))

@@ -272,7 +272,7 @@ def test_the_lock_file_of_another_user(tmp_path, monkeypatch):
         os, "open", Mock(side_effect=PermissionError(errno.EACCES, "Permission denied"))
     )
     message = (
-        r"\.lock: this lock file belongs to another user.*remove the file\. Otherwise choose "
+        r"\.lock: this lock file belongs to another user.*remove the file\. Otherwise, choose "
         r"another -o"
     )
     with pytest.raises(OutputError, match=message), locked(tmp_path):

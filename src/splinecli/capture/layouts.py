@@ -31,7 +31,6 @@ from splinecli.records.capture_warnings import CaptureWarning
 from splinecli.system.files import StrPath, is_folder, resolve
 
 _PREFIX = "images_"
-_LIGHTS = "light.txt"
 _BOUNDARIES = ("inboundary.png", "onboundary.png")
 
 

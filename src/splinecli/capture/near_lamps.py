@@ -270,7 +270,8 @@ class LampOptions:
     """The user's options for near lamps and the camera. All lengths are in one unit, such as
     millimetres.
 
-    Raises UsageError if two options cannot be used together.
+    Positions replace a distance, and a pixel size the object's width. Raises UsageError for a
+    distance without the size of a pixel.
     """
 
     positions: str | None = None  # a file of lamp positions, which replaces the light file
@@ -282,12 +283,6 @@ class LampOptions:
     camera_matrix: str | None = None  # a file with the 3 x 3 camera matrix in pixels
 
     def __post_init__(self) -> None:
-        for one, other in (("positions", "distance"), ("pixel_size", "object_width")):
-            if None not in (getattr(self, one), getattr(self, other)):
-                raise UsageError(
-                    f"{_OPTIONS[one]} and {_OPTIONS[other]} cannot be used together",
-                    hint="Leave one out",
-                )
         if self.distance is not None and self.pixel_size is None and self.object_width is None:
             raise UsageError(
                 "--light-distance needs the size of a pixel",

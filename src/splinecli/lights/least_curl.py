@@ -27,20 +27,18 @@ OPPOSITE = np.array((-1.0, -1.0, 1.0))
 """Factors of the lights under which a hollow looks like a bump under the original lights."""
 
 
-def normal_derivatives(
-    normals: Floats, mask: Bools, *, most: int, smoothing: float = 1.0
-) -> Float64Array | None:
+def normal_derivatives(normals: Floats, mask: Bools, *, most: int) -> Float64Array | None:
     """Return normals and their derivatives to the right and upwards (3, p, 3).
 
     There are at most `most` pixels, all with neighbours; None for fewer than 50. The normals (H, W,
-    3) in a mask (H, W) may have any length; `smoothing` is in pixels.
+    3) in a mask (H, W) may have any length.
     """
     inside = binary_erosion(mask)
     if np.count_nonzero(inside) < 50 or min(mask.shape) < 2:
         return None
-    share = np.maximum(gaussian_filter(mask.astype(np.float64), smoothing), 1e-6)
+    share = np.maximum(gaussian_filter(mask.astype(np.float64), 1.0), 1e-6)
     smooth = gaussian_filter(
-        np.where(mask[..., None], normals, 0.0), (smoothing, smoothing, 0), output=np.float64
+        np.where(mask[..., None], normals, 0.0), (1.0, 1.0, 0), output=np.float64
     )
     smooth /= share[..., None]
     downwards, right = np.gradient(smooth, axis=(0, 1))

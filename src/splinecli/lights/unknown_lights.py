@@ -44,7 +44,7 @@ from splinecli.lights.outline import DARK_SHARE, is_outlined, turn_at_outline
 from splinecli.lights.rough_normals import cast_shadows, smooth_normals
 from splinecli.maths import Bools, Float32Array, Float64Array
 from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.maths.pixel_grid import Blocks
+from splinecli.maths.pixel_grid import Blocks, on_map
 from splinecli.maths.robust import fit_robustly, shadow_weights
 from splinecli.surface.integration import integrate_normals
 from splinecli.system.machine import side_by_side
@@ -69,8 +69,7 @@ def bump_log_odds(observations: Float32Array, mask: Bools, light_directions: Flo
     rim = rough.rim()
     outline = 0.0 if np.isnan(rim) else rim * rough.rim_steepness
 
-    normals = np.zeros((*mask.shape, 3))
-    normals[mask] = unit(scaled)
+    normals = on_map(unit(scaled), mask)
     normals[..., 2] = np.where(mask, normals[..., 2].clip(min=_LEAST_Z), 0)
     heights = np.where(mask, integrate_normals(unit(normals), mask), np.nan)
     predicted = scaled @ light_directions.T

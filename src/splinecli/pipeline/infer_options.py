@@ -317,7 +317,11 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
     # whether a surface in the unit of pixel_size is computed, too; a field of InferOptions
     surface = False
 
-    CONFLICTS: ClassVar[records.Conflicts] = (("lights_in_channels", "align", LEAVE_ONE),)
+    CONFLICTS: ClassVar[records.Conflicts] = (
+        ("lights_in_channels", "align", LEAVE_ONE),
+        ("light_positions", "light_distance", LEAVE_ONE),
+        ("pixel_size", "object_width", LEAVE_ONE),
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

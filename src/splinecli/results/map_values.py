@@ -14,6 +14,7 @@ from splinecli.capture import Capture, CaptureSource
 from splinecli.capture.linearise import StoredPixels, take_pixels
 from splinecli.maths import Picture
 from splinecli.maths.normals import curvature_of_normals, gradient_of_normals
+from splinecli.maths.pixel_grid import on_map
 from splinecli.pictures.maps import (
     albedo_picture,
     confidence_picture,
@@ -126,9 +127,8 @@ def albedo_map(
         total += colours
         squares += weight * cosine
         del colours
-    albedo = np.zeros((*capture.mask.shape, 3), np.float32)
-    albedo[capture.mask] = np.divide(total, squares[:, None], out=total, where=squares[:, None] > 0)
-    return albedo
+    albedo = np.divide(total, squares[:, None], out=total, where=squares[:, None] > 0)
+    return on_map(albedo, capture.mask)
 
 
 def colours_of_surface(

@@ -12,6 +12,7 @@ from splinecli.capture import CaptureSource
 from splinecli.capture.linearise import take_pixels
 from splinecli.estimate.inference import lighting_on
 from splinecli.maths import Bools, Float32Array, Picture
+from splinecli.maths.pixel_grid import on_map
 from splinecli.maths.transfer import encode_srgb
 from splinecli.records.capture_warnings import GRAY_MATERIAL, ROUGHNESS_UNDETERMINED, CaptureWarning
 from splinecli.records.documents import MaterialFacts
@@ -63,11 +64,8 @@ def material(source: CaptureSource, estimate: NormalEstimate, progress: Progress
     """
     normals = take_pixels(estimate.normal_map, estimate.capture.mask)
     found = material_of(estimate, colours_of_surface(source, estimate.capture, normals, progress))
-    maps = np.zeros((*estimate.capture.mask.shape, 7), np.float32)
-    maps[estimate.capture.mask] = np.column_stack(
-        (found.base_colour, found.roughness, found.metalness, found.specular, found.confidence)
-    )
-    return maps
+    columns = (found.base_colour, found.roughness, found.metalness, found.specular)
+    return on_map(np.column_stack((*columns, found.confidence)), estimate.capture.mask)
 
 
 def material_of(

@@ -17,7 +17,7 @@ import numpy as np
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Bools, Float32Array, Float64Array, Floats
 from splinecli.maths.normals import unit
-from splinecli.maths.pixel_grid import Blocks, focal_length
+from splinecli.maths.pixel_grid import Blocks, focal_length, on_map
 from splinecli.surface.bilateral_equations import (
     DISCONTINUITY,
     SMALLEST_COSINE,
@@ -130,9 +130,8 @@ class _Surface(NamedTuple):
 
     def of_blocks(self, blocks: Blocks, *, keep_edges: bool) -> _Surface:
         """Return the surface at the scale of blocks; see _normals_of."""
-        normals = np.zeros((*blocks.mask.shape, 3))
         of_pixels = self.normal_map[self.mask].astype(np.float64)
-        normals[blocks.mask] = _normals_of(blocks, of_pixels, self.mask, keep_edges=keep_edges)
+        normals = _normals_of(blocks, of_pixels, self.mask, keep_edges=keep_edges)
         prior = None
         if self.prior is not None:
             values = np.stack((np.nan_to_num(self.prior), np.isfinite(self.prior)), axis=1)
@@ -141,7 +140,8 @@ class _Surface(NamedTuple):
                 sums, known * blocks.step, out=np.full(len(sums), np.nan), where=known > 0
             )
         camera = blocks.shrink_camera(self.camera_matrix)
-        return _Surface(normals, blocks.mask, camera, prior, self.prior_detail / blocks.step)
+        detail = self.prior_detail / blocks.step
+        return _Surface(on_map(normals, blocks.mask), blocks.mask, camera, prior, detail)
 
 
 def _integrate(
@@ -162,11 +162,12 @@ def _integrate(
     if is_huge or (n_pixels > COARSEST and discontinuity > 0):
         blocks = Blocks.of_step(mask, 2)
         coarse = surface.of_blocks(blocks, keep_edges=not is_huge)
-        of_blocks, own_share = np.zeros(blocks.mask.shape), 0.75
-        of_blocks[blocks.mask] = _integrate(
+        own_share = 0.75
+        of_blocks = _integrate(
             coarse, discontinuity, still / 2, lambda share: progress((1 - own_share) * share)
         )
-        heights = blocks.step * np.asarray(blocks.interpolate(of_blocks, mask), np.float64)
+        of_map = on_map(of_blocks, blocks.mask)
+        heights = blocks.step * np.asarray(blocks.interpolate(of_map, mask), np.float64)
         if is_huge:
             return heights
         most = min(20, max(4, 1_000_000 // n_pixels))

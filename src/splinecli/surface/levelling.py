@@ -9,6 +9,7 @@ import numpy as np
 from splinecli.errors import UsageError
 from splinecli.maths import Bools, Float32Array, Float64Array, Floats
 from splinecli.maths.normals import unit
+from splinecli.maths.pixel_grid import on_map
 
 _FITS = 50
 _CUT = 2.5  # robust standard deviations at which the weight of a residual is halved
@@ -70,7 +71,6 @@ def level_heights(
 
 def level_normals(normal_map: Floats, mask: Bools, slopes: tuple[float, float]) -> Float32Array:
     """Return the normals (H, W, 3) of the levelled surface; zero outside the mask."""
-    levelled = np.zeros(normal_map.shape, np.float32)
     x, y, z = normal_map[mask].astype(np.float64).T
-    levelled[mask] = unit(np.stack((x + slopes[0] * z, y + slopes[1] * z, z), axis=1))
-    return levelled
+    levelled = unit(np.stack((x + slopes[0] * z, y + slopes[1] * z, z), axis=1))
+    return on_map(levelled.astype(np.float32), mask)

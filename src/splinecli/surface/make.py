@@ -10,7 +10,7 @@ import numpy as np
 from splinecli.errors import UsageError
 from splinecli.maths import Bools, Float32Array, Floats
 from splinecli.maths.normals import unit as unit_vectors
-from splinecli.maths.pixel_grid import focal_length
+from splinecli.maths.pixel_grid import focal_length, on_map
 from splinecli.records.documents import SurfaceFacts, Unit
 from splinecli.surface.bilateral_equations import DISCONTINUITY
 from splinecli.surface.integration import integrate_normals
@@ -86,8 +86,12 @@ def make_surface(
     prior, aspect = settings.prior, settings.pixel_aspect
     if prior is not None and camera_matrix is None and settings.pixel_size_mm is not None:
         prior = prior / settings.pixel_size_mm
+    stretched = normal_map
+    if aspect != 1:  # the normals of a surface with the same heights on square pixels
+        vectors = normal_map[mask] * np.array((1, aspect, 1), np.float32)
+        stretched = on_map(unit_vectors(vectors), mask)
     depth = integrate_normals(
-        normal_map if aspect == 1 else _stretched(normal_map, mask, aspect),
+        stretched,
         mask,
         camera_matrix,
         discontinuity=settings.discontinuity,
@@ -139,10 +143,3 @@ def make_surface(
             "tilt_deg": round(tilt_deg, 4),
         }
     return Surface(depth, mesh, unit, millimetres, level_map), report
-
-
-def _stretched(normal_map: Float32Array, mask: Bools, aspect: float) -> Float32Array:
-    """Return the normals of a surface with the same heights on square pixels."""
-    stretched = np.zeros_like(normal_map)
-    stretched[mask] = unit_vectors(normal_map[mask] * np.array((1, aspect, 1), np.float32))
-    return stretched

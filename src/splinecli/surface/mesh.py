@@ -22,7 +22,14 @@ from numpy.typing import NDArray
 from splinecli.errors import InputError, UsageError
 from splinecli.maths import Bools, Float32Array, Float64Array, Floats, Indices, Integers, Picture
 from splinecli.maths.normals import unit
-from splinecli.maths.pixel_grid import Blocks, focal_length, image_points, pixel_rays, ray_basis
+from splinecli.maths.pixel_grid import (
+    Blocks,
+    focal_length,
+    image_points,
+    on_map,
+    pixel_rays,
+    ray_basis,
+)
 from splinecli.system.machine import import_extra
 
 
@@ -289,9 +296,8 @@ def _mesh_of_blocks(
 ) -> SurfaceMesh:
     """Return the mesh of a map's blocks of step x step pixels, in the frame of the map."""
     blocks = Blocks.of_step(mask, step)
-    of_blocks = np.zeros((*blocks.mask.shape, 4))
     pixels = np.concatenate((depth[mask][:, None], normal_map[mask]), axis=1)
-    of_blocks[blocks.mask] = blocks.average(pixels, mask)
+    of_blocks = on_map(blocks.average(pixels, mask).astype(np.float64), blocks.mask)
     # Without a camera matrix, lengths are measured in blocks instead of pixels.
     scale = step if camera_matrix is None else 1
     mesh = surface_mesh(
