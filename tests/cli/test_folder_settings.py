@@ -42,7 +42,7 @@ def test_written_settings_are_read(unusual, run, document):
         ("a = 1\n", ("toml:1:", "unknown setting 'a'", "light-frame")),
         ("\nwhite-level = 'high'", ("toml:2:", "white-level")),
         ("output = 'x'", "unknown setting 'output'"),
-        ("lights = '../lights.txt'", "outside the folder"),
+        ("lights = '../lights.txt'", "expected a path inside the folder"),
         ("light-frame = 'z-up'", "z-up"),
     ],
 )

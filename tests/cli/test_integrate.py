@@ -88,7 +88,7 @@ def test_the_convention_of_a_folder_is_recognised(run, capture, form, given):
 
 def test_an_array_of_something_else(run):
     np.save("albedo.npy", np.random.default_rng(0).uniform(0, 0.4, (*SHAPE, 3)).astype(np.float32))
-    run("integrate albedo.npy -o out", code=3, says="these are not normals")
+    run("integrate albedo.npy -o out", code=3, says="this is not a normal map")
 
 
 @pytest.mark.parametrize("where", ["mask", "alpha"])
@@ -102,7 +102,7 @@ def test_a_background_that_is_not_black(run, where):
     cv2.imwrite("mask.png", cut)
     arguments = "integrate white.png -o out --format npy"
     if where == "mask":
-        run(arguments, code=3, says="these are not normals")
+        run(arguments, code=3, says="this is not a normal map")
         arguments += " --mask mask.png"
     run(arguments)
     check_heights(np.load("out/depth.npy"))

@@ -82,8 +82,8 @@ def check_crosstalk(matrix: Float64Array, path: Path) -> None:
         raise InputError(
             f"the channels do not separate the lamps, because the crosstalk matrix has {number}",
             path,
-            hint=f"Expected a condition number of at most {LARGEST_CONDITION:.0f}:"
-            " use lamps with more distinct colours",
+            hint="Use lamps with more distinct colours, for a condition number of at most"
+            f" {LARGEST_CONDITION:.0f}",
         )
 
 

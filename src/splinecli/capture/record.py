@@ -167,17 +167,13 @@ class Capture:
             observations=self.observations[:, chosen],
             light_directions=self.light_directions[chosen],
             light_indices=tuple(self.light_indices[i] for i in chosen),
-            estimated_intensities=None
-            if self.estimated_intensities is None
-            else self.estimated_intensities[chosen],
-            estimated_colours=None
-            if self.estimated_colours is None
-            else self.estimated_colours[chosen],
             restored=None if self.restored is None else self.restored[:, chosen],
             lamps=None if self.lamps is None else self.lamps.choose_lights(chosen),
-            light_errors_deg=None
-            if self.light_errors_deg is None
-            else self.light_errors_deg[chosen],
+            **{
+                name: values[chosen]
+                for name in ("estimated_intensities", "estimated_colours", "light_errors_deg")
+                if (values := getattr(self, name)) is not None
+            },
         )
 
     def choose_pixels(self, positions: Integers) -> Capture:
@@ -196,24 +192,16 @@ class Capture:
         )
 
     def _check_lights(self) -> None:
-        lights = self.light_directions
-        if lights.ndim != 2 or lights.shape[1] != 3:
-            raise InputError(
-                f"{self.name}: light directions of shape {lights.shape}, expected (F, 3)"
-            )
-        if len(self.light_indices) != len(lights):
-            raise InputError(
-                f"{self.name}: {len(self.light_indices)} light indices for {len(lights)} lights"
-            )
-        if len(lights) < MIN_LIGHTS:
+        lights, count = self.light_directions, len(self.light_indices)
+        self._check_shape("light directions", lights, (count, 3))
+        if count < MIN_LIGHTS:
             hint = "A normal has three unknowns, so at least three different lights are needed"
-            found = "1 light" if len(lights) == 1 else f"{len(lights)} lights"
+            found = "1 light" if count == 1 else f"{count} lights"
             raise InputError(f"{self.name}: {found}, expected at least {MIN_LIGHTS}", hint=hint)
-        self._check_shape("light intensities", self.estimated_intensities, (len(lights),))
-        self._check_shape("light colours", self.estimated_colours, (len(lights), 3))
-        if not np.isfinite(lights).all():
-            raise InputError(f"{self.name}: a light direction is not finite")
-        if (np.abs(np.linalg.norm(lights, axis=1) - 1) > _UNIT_TOLERANCE).any():
+        self._check_shape("light intensities", self.estimated_intensities, (count,))
+        self._check_shape("light colours", self.estimated_colours, (count, 3))
+        # NaN fails this form of the check.
+        if not (np.abs(np.linalg.norm(lights, axis=1) - 1) <= _UNIT_TOLERANCE).all():
             raise InputError(f"{self.name}: a light direction is not a unit vector")
         if (lights[:, 2] <= 0).any():
             below = self.light_indices[int(np.argmax(lights[:, 2] <= 0))]
@@ -221,7 +209,7 @@ class Capture:
             raise InputError(problem, hint="z points to the camera")
         if in_one_plane(lights):
             problem = (
-                f"{self.name}: the {len(lights)} lights are in one plane, so the normals cannot be"
+                f"{self.name}: the {count} lights are in one plane, so the normals cannot be"
                 " determined"
             )
             raise InputError(problem, hint="Choose lights that surround the viewing direction")

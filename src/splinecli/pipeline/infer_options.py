@@ -603,7 +603,7 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
             )
         if self.finds_lights and self.refine_lights:
             raise UsageError(
-                "--lights estimate refines the lights that it finds",
+                "--lights estimate already refines the lights that it finds",
                 hint="Leave --refine-lights out",
             )
         check_method(self.method)

@@ -120,7 +120,6 @@ def load_module(module: Module, path: Path, expected_format: str) -> Module:
 def check_shipped(path: Path, sha256: str, name: str) -> None:
     if file_sha256(path) != sha256:
         raise ModelError(
-            f"the shipped weights {name!r} were modified, because their SHA-256 does not match"
-            " weights.json",
+            f"the shipped weights {name!r} were modified: their SHA-256 is not in weights.json",
             hint="Reinstall splinecli",
         )

@@ -168,7 +168,7 @@ def test_shipped_weights_by_name(saved, monkeypatch):
     )
     assert resolve_weights("good").name == "good"
     assert resolve_weights(str(saved)).name == "tiny"
-    with pytest.raises(ModelError, match="the shipped weights 'bad' were changed"):
+    with pytest.raises(ModelError, match="the shipped weights 'bad' were modified"):
         resolve_weights("bad")
     with pytest.raises(ModelError, match=r"expected one of bad, good, or a \.safetensors file"):
         resolve_weights("better")

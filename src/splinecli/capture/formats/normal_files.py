@@ -162,8 +162,8 @@ def read_mat(path: Path, expected: images.ExpectedSize | None) -> Array:
             maps = {v.name: v for v in variables if len(v.shape) == 3 and v.shape[2] == 3}
             if len(maps) != 1:
                 raise InputError(
-                    "found no array Normal_gt, and of other arrays H x W x 3"
-                    f" {', '.join(maps) or 'none'}, expected exactly one",
+                    "expected an array Normal_gt or a single array H x W x 3, found"
+                    f" {', '.join(maps) or 'none'}",
                     path,
                 )
             (variable,) = maps.values()
