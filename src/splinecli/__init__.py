@@ -18,7 +18,7 @@ __all__ = ["__version__", "estimate_material", "estimate_normals", "integrate_no
 
 
 def __getattr__(name: str) -> Any:
-    """Return a function of splinecli.api, which is imported when it is first used."""
+    """Return a function of splinecli.api, which is imported on first use."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from splinecli import api

@@ -1,4 +1,4 @@
-"""The functions for arrays, for example in a notebook: `splinecli.estimate_normals` and its
+"""Functions for arrays, for example in a notebook: `splinecli.estimate_normals` and its
 companions.
 """
 
@@ -54,49 +54,47 @@ def estimate_normals(  # noqa: PLR0913 - keyword arguments suit a notebook
         light_directions: (F, 3), from the object towards the lights, of any length; x right, y up,
             z to the camera. None estimates them from the images, as `infer --lights estimate` does.
             See capture.light_errors_deg.
-        mask: (H, W), True at the pixels of the object, or numbers above half of their largest one,
-            as in a mask file. None uses all pixels.
-        light_intensities: (F,) or (F, 3) RGB. None means that they are unknown; they are then
-            estimated if the images show that they differ.
-        first_light: if light_directions is None, the side of the image from which the first light
-            comes, such as "left" or "upper-left", or its azimuth in degrees, counter-clockwise from
-            the right. It is required if the images show no outline of the object.
-        pixel_size: for near lamps, the width of a pixel on the object. light_directions are then
-            the positions of the lamps in the same unit, from the middle of the image on the
-            object's mean plane.
+        mask: (H, W), True at the pixels of the object. In a mask of numbers, as in a mask file,
+            these are the values above half of the maximum. None uses all pixels.
+        light_intensities: (F,) or (F, 3) RGB. If they are None, they are estimated if the images
+            show that they differ.
+        first_light: if light_directions is None, the side of the image that the first light comes
+            from, such as "left" or "upper-left", or its azimuth in degrees, counter-clockwise from
+            the right. It is required if the images do not show the outline of the object.
+        pixel_size: the width of a pixel on the object, for near lamps. In this case,
+            light_directions are positions of the lamps in the same unit, relative to the centre of
+            the image on the object's mean plane.
         camera_matrix: (3, 3) in pixels, as in OpenCV, for a camera that is close relative to the
-            object's width. The light directions are then in the frame of its axis. None assumes an
-            orthographic camera.
+            object's width. Light directions are relative to its axis. None assumes an orthographic
+            camera.
         method: a name of `splinecli infer --method`, such as "spline-net" or "ls". See
             splinecli.estimate.methods.METHODS.
         as_stored: use the image values unchanged. By default, lens blur is removed, saturated
             observations are restored and unknown light intensities are estimated.
-        white_level: the value at and above which an observation is saturated, in the unit of the
-            images. None detects it for integer images; floating-point images then have no white
-            level.
+        white_level: observations at or above this value are saturated, in the unit of the images.
+            None detects it in integer images, and assumes no saturation in floating-point images.
         weights: name or file of a network's weights. None uses the method's default.
-        rotations: number of rotations of the lights whose normals a network averages. None uses the
-            method's default.
-        distil: approximate the method by a small network, trained on a sample of the pixels, for
-            the remaining pixels. False uses the method on every pixel; None distils for 100,000
-            pixels and more.
+        rotations: number of rotations of the lights over which a network averages its normals. None
+            uses the method's default.
+        distil: whether to approximate the method by a small network, trained on a sample of the
+            pixels. False applies the method to every pixel; None distils from 100,000 pixels.
         batch_size: pixels per batch. None uses the method's default.
         device: where to compute; "auto" is a CUDA GPU if there is one.
-        precision: number format of a network; "auto" is bfloat16 where the device computes natively
-            in it.
+        precision: number format of a network; "auto" is bfloat16 if the device supports it
+            natively.
         progress: called with the number of pixels just finished, about every 1,000 pixels for
             networks.
 
     Returns:
         A record with normal_map, (H, W, 3) float32, x right, y up, z to the camera, unit in the
-        mask and zero outside; confidence_map, (H, W) float32, the probability that a normal is off
-        by at most 5 degrees, or None if the method does not estimate it (only spline-net and
+        mask and zero outside; confidence_map, (H, W) float32, the probability that the error is at
+        most 5 degrees, or None if the method does not estimate it (only spline-net and
         spline-net-pixelwise do, with the shipped weights or others that have an error head); and
         capture, with the observations and with warnings that you should read.
 
     Raises:
         splinecli.errors.UsageError: a shape, a type or an option is invalid.
-        splinecli.errors.InputError: a value is not finite or negative, the lights cannot give
+        splinecli.errors.InputError: a value is negative or not finite, the lights do not determine
             normals (fewer than three, below the horizon, all in one plane), or the mask is empty.
         splinecli.errors.ModelError: the weights cannot be used.
 
@@ -128,7 +126,7 @@ def estimate_normals(  # noqa: PLR0913 - keyword arguments suit a notebook
     check_method(method)
     if first_light is not None and light_directions is not None:
         raise UsageError(
-            "first_light is for lights that are found", hint="Leave it or light_directions out"
+            "first_light and light_directions cannot be used together", hint="Leave one out"
         )
     source = open_arrays(
         images,
@@ -156,8 +154,9 @@ def estimate_normals(  # noqa: PLR0913 - keyword arguments suit a notebook
 
 
 def estimate_material(estimate: NormalEstimate, colours: ArrayLike | None = None) -> MaterialMaps:
-    """Estimate base colour, roughness, metalness and specular reflection, as `infer --maps
-    material` does.
+    """Estimate base colour, roughness, metalness and specular reflection of each pixel.
+
+    The result is the same as for `infer --maps material`.
 
     Args:
         estimate: the result of estimate_normals.
@@ -167,7 +166,7 @@ def estimate_material(estimate: NormalEstimate, colours: ArrayLike | None = None
     Returns:
         A record of arrays for the P pixels of the mask, row by row: base_colour (P, 3), and
         roughness, metalness, specular and confidence (P,). `is_gray` is True if the base colour
-        contains brightness alone.
+        contains only brightness.
 
     Raises:
         splinecli.errors.InputError: there are fewer than four lights, or a colour is not finite.
@@ -204,7 +203,7 @@ def estimate_material(estimate: NormalEstimate, colours: ArrayLike | None = None
         raise InputError("some colours are not finite", hint="Leave their pixels out of the mask")
     images = (image[capture.mask].astype(np.float32) for image in stack)
     means = capture.observations.T
-    # The observations may have another scale, and restored values.
+    # The observations may have another scale, and contain restored values.
     scaled = (
         image * (mean / np.maximum(image.mean(axis=1), 1e-12))[:, None]
         for image, mean in zip(images, means, strict=True)
@@ -219,8 +218,9 @@ def integrate_normals(
     *,
     discontinuity: float = 2.0,
 ) -> NDArray[np.float64]:
-    """Integrate a normal map (H, W, 3) into a height or depth map (H, W), float64, NaN outside the
-    mask.
+    """Integrate a normal map (H, W, 3) into a height or depth map (H, W) float64.
+
+    The result is NaN outside the mask.
 
     For an orthographic camera, the result is the height towards the camera in pixels. With a camera
     matrix, it is the positive depth along the viewing axis, of unknown scale.

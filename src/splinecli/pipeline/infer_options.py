@@ -134,7 +134,7 @@ Update = Annotated[
 
 
 class Display(Record, frozen=True, kw_only=True):
-    """What a command prints."""
+    """How a command prints its output."""
 
     as_json: bool = flag(
         "Output", "Print one JSON document on stdout, and nothing else.", names="--json"

@@ -206,8 +206,8 @@ class _Listing(Struct):
 
 
 def _earlier_files(folder: Path) -> list[str]:
-    """Return the surface files that an earlier `integrate` wrote to the folder, excluding those of
-    `infer`.
+    """Return the surface files that an earlier `integrate` wrote to the folder. Files of `infer`
+    are kept.
     """
     try:
         named = read_json(folder / SURFACE_REPORT, _Listing).files

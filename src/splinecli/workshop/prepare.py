@@ -28,10 +28,10 @@ from splinecli.workshop.synthesis.scenes import SceneConfig
 def prepare_pixel_set(options: PrepareOptions, observer: Observer = SILENT) -> dict[str, Any]:
     """Write a pixel set, or add to it, and return its summary, which `prepare --json` prints.
 
-    A capture that cannot be used is left out, and the observer is told the error; `skipped` in the
-    summary contains the reason and an exit code. Any other error stops the work, and calling the
-    function again resumes it: InputError for a mesh, OutputError also if the set contains a scene
-    with other settings, or UsageError if there is nothing to prepare.
+    A capture that cannot be used is left out. Its error is passed to the observer, and `skipped` in
+    the summary contains the reason and an exit code. Any other error stops the work, and calling
+    the function again resumes it: InputError for a mesh, OutputError also if the set contains a
+    scene with other settings, or UsageError if there is nothing to prepare.
     """
     output, usual = options.output, SceneConfig()
     size, n_lights = options.size or usual.size, options.n_lights or usual.lights
