@@ -196,7 +196,7 @@ def test_python():
     assert np.median(errors) < mean_angle(capture.light_directions, true) + 3
     for lights_given, options, message in (
         (None, {"pixel_size": 1.0}, "near lamps need positions"),
-        (true, {"first_light": "left"}, "first_light is for lights that are found"),
+        (true, {"first_light": "left"}, "first_light and light_directions cannot be used together"),
         (None, {"first_light": "north"}, "found 'north' as the side"),
         (None, {"first_light": 400}, "found '400' as the side"),
     ):
