@@ -35,7 +35,15 @@ def write(path, picture):
 @pytest.mark.parametrize("photographs", [".png", ".pgm", ".webp", ".jpg", "stack"])
 @pytest.mark.parametrize(
     "mask",
-    ["mask.pgm", "mask.webp", "owl_mask.png", "face_mask.pgm", "owlMask.webp", "stack_mask.tif"],
+    [
+        "mask.pgm",
+        "mask.webp",
+        "owl_mask.png",
+        "face_mask.pgm",
+        "owlMask.webp",
+        "owlmask.png",
+        "stack_mask.tif",
+    ],
 )
 def test_masks_in_every_format(tmp_path, photographs, mask):
     if photographs == "stack":

@@ -327,6 +327,9 @@ def test_the_largest_part_with_its_holes_filled():
     assert (found != thing).mean() < 0.005
     assert found[pupil].all()
     assert not found[crumb].any()
+    with pytest.raises(InputError, match="several areas are bright"):
+        wide = np.where(disc(100, 15, 14), 0.6, brightness)
+        find_object(wide.astype(np.float32), is_requested=False)
 
 
 @pytest.mark.parametrize(

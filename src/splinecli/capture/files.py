@@ -76,7 +76,8 @@ def natural_key(path: Path) -> tuple[list[int | str], str]:
 
 # Words in the names of pictures that are not photographs
 ROLES = {
-    "mask": re.compile(r"((?<![a-z])m|(?<=[a-z])M)asks?(?![a-z])"),  # also faceMask
+    # also faceMask and facemask, but not damask
+    "mask": re.compile(r"((?<![a-z])m|(?<=[a-z])M)asks?(?![a-z])|(?<=[a-z])(?<!da)masks?$"),
     "ambient": re.compile(r"(?<![a-z])ambient(?![a-z])"),
 }
 

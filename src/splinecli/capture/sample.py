@@ -73,11 +73,8 @@ def leave_out_background(sample: Sample) -> tuple[Sample, float]:
         return sample, 0.0
     brightness = sample.observations.mean(axis=1).reshape(sample.mask.shape).astype(np.float32)
     try:
-        inside = find_object(brightness)
+        inside = find_object(brightness, is_requested=False)
     except InputError:
-        return sample, 0.0
-    # A background is dark if its median brightness is below this share of the object's.
-    if np.median(brightness[~inside]) > 0.15 * np.median(brightness[inside]):
         return sample, 0.0
     return Sample(sample.observations[inside.ravel()], inside, sample.step), float(
         1 - inside.mean()

@@ -8,6 +8,7 @@ from splinecli.errors import InputError
 from splinecli.maths import Bools, Float32Array
 
 _DARK = 0.2  # brightness of a dark background, as a share of the object's
+_ELSEWHERE = 0.1  # bright area outside the object, as a share of the object's
 
 
 def surrounds_hole(mask: Bools) -> bool:
@@ -36,7 +37,8 @@ def find_object(brightness: Float32Array, *, is_requested: bool = True) -> Bools
     holes filled. This fails if the background is as bright as the object. The brightness (H, W) is
     linear: the mean over all lights. Raises InputError if nearly nothing is brighter than the
     background, or nearly everything is; for a mask that was not requested, also if the background
-    is not dark, because the darker part of an object that fills the image looks like one.
+    is not dark, because the darker part of an object that fills the image looks like one, or if it
+    has other bright areas, because the largest may be only a part of the object.
     """
     import cv2
 
@@ -64,4 +66,6 @@ def find_object(brightness: Float32Array, *, is_requested: bool = True) -> Bools
     ratio = float(np.median(smooth[~mask]) / max(np.median(smooth[mask]), 1e-12))
     if not is_requested and ratio > _DARK:
         raise InputError(f"no mask was found: the background is not dark ({100 * ratio:.0f} %)")
+    if not is_requested and (bright[~mask] > 0).sum() > _ELSEWHERE * mask.sum():
+        raise InputError("no mask was found: several areas are bright")
     return np.asarray(mask)
