@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splinecli.capture import linearise, near_lamps
+from splinecli.capture import lamp_files, linearise
 from splinecli.capture.channel_lights import (
     CHANNELS,
     CROSSTALK,
@@ -80,7 +80,7 @@ class CaptureOptions:
     white_level: float | None = None
     light_frame: LightFrame = USUAL_FRAME
     light_format: LightForm = "xyz"
-    lamps: near_lamps.LampOptions = near_lamps.NO_LAMP_OPTIONS
+    lamps: lamp_files.LampOptions = lamp_files.NO_LAMP_OPTIONS
     window: linearise.Window = linearise.WHOLE
     needs_lights: bool = True
     lights_in_channels: bool = False
@@ -110,7 +110,7 @@ def open_capture(folder: StrPath, options: CaptureOptions = CaptureOptions()) ->
     check_white_level(options.white_level)
     files, near, form = _find_files(Path(folder), options)
     radiometry = options.radiometry
-    camera_matrix, of_camera = near_lamps.find_camera(Path(folder), near, options.lamps)
+    camera_matrix, of_camera = lamp_files.find_camera(Path(folder), near, options.lamps)
     of_lamps = (*(() if near is None else near.stamp), *of_camera)
     stamp = stamp_files(files, radiometry.flat_field, of_lamps)
     options, of_near_ps = _with_near_ps(files, options, near, camera_matrix)
@@ -135,7 +135,7 @@ def open_capture(folder: StrPath, options: CaptureOptions = CaptureOptions()) ->
     if channels is not None:
         warnings.append(CaptureWarning(codes.LIGHTS_IN_CHANNELS, channels.in_words()))
     if files.light_directions is not None and form == "xyz" and near is None:
-        warnings += near_lamps.positions_as_directions(files.light_directions)
+        warnings += lamp_files.positions_as_directions(files.light_directions)
     facts = tuple(map(read_header, files.images))
     factors = np.ones((len(facts), 3))
     if intensities is None and (exposures := exposure_factors(facts)) is not None:
@@ -176,18 +176,18 @@ def open_capture(folder: StrPath, options: CaptureOptions = CaptureOptions()) ->
 def _with_near_ps(
     files: CaptureFiles,
     options: CaptureOptions,
-    near: near_lamps.LampFiles | None,
+    near: lamp_files.LampFiles | None,
     camera_matrix: Float64Array | None,
 ) -> tuple[CaptureOptions, Float64Array | None]:
     """Return the options with the frame of the lamps if their file is one of near_ps, and their
     light intensities. Raises InputError.
     """
     path = None if near is None or not near.used else near.positions
-    if near is None or path is None or not near_lamps.is_near_ps(path):
+    if near is None or path is None or not lamp_files.is_near_ps(path):
         return options, None
     shape = read_header(files.images[0]).size[0]
-    frame = near_lamps.near_ps_frame(near, camera_matrix, shape)
-    return replace(options, light_frame=frame), near_lamps.near_ps_intensities(path, frame)
+    frame = lamp_files.near_ps_frame(near, camera_matrix, shape)
+    return replace(options, light_frame=frame), lamp_files.near_ps_intensities(path, frame)
 
 
 def _with_flat_fields(
@@ -209,7 +209,7 @@ def _with_flat_fields(
 
 def _find_files(
     folder: Path, options: CaptureOptions
-) -> tuple[CaptureFiles, near_lamps.LampFiles | None, RowForm]:
+) -> tuple[CaptureFiles, lamp_files.LampFiles | None, RowForm]:
     """Return the files of a capture, its near lamps, and what the rows of its light file are."""
     intensities = None if options.are_equal else options.intensities
     given = (options.lights, intensities, options.mask, options.ground_truth)
@@ -222,7 +222,7 @@ def _find_files(
     form: RowForm = options.light_format
     near = None
     if options.needs_lights:
-        near = near_lamps.find_lamps(folder, overrides.lights, options.lamps)
+        near = lamp_files.find_lamps(folder, overrides.lights, options.lamps)
     if near is not None and near.used and near.positions is not None:
         if form != "xyz":
             problem = (

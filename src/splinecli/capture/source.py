@@ -26,6 +26,7 @@ from splinecli.capture.formats.images import (
     read_mask,
 )
 from splinecli.capture.formats.normal_files import read_ground_truth
+from splinecli.capture.lamp_files import LampFiles
 from splinecli.capture.light_rows import USUAL_FRAME, LightFrame
 from splinecli.capture.linearise import (
     AS_STORED,
@@ -34,7 +35,7 @@ from splinecli.capture.linearise import (
     StoredPixels,
     Window,
 )
-from splinecli.capture.near_lamps import LampFiles, NearLamps, check_distances, distant_lights
+from splinecli.capture.near_lamps import NearLamps, check_distances, distant_lights
 from splinecli.capture.record import check_light_indices
 from splinecli.errors import InputError, UsageError
 from splinecli.images.alignment import AlignedImages, resample

@@ -19,11 +19,11 @@ from msgspec import NODEFAULT, Meta
 from splinecli.capture import CaptureOptions, CaptureSource, RadiometricCalibration, open_capture
 from splinecli.capture.files import check_not_empty, list_images
 from splinecli.capture.formats.numbers import to_number
+from splinecli.capture.lamp_files import LampOptions
 from splinecli.capture.light_files import light_suffixes
 from splinecli.capture.light_rows import EXCHANGED, LightForm, parse_light_frame
 from splinecli.capture.light_search import NoLightsError
 from splinecli.capture.linearise import parse_window
-from splinecli.capture.near_lamps import LampOptions
 from splinecli.capture.reader import EQUAL
 from splinecli.capture.record import ESTIMATE, SIDES_DEG, azimuth_of, check_light_indices
 from splinecli.errors import UsageError

@@ -14,8 +14,8 @@ from msgspec import Struct
 from splinecli.capture import read_image, read_normal_map
 from splinecli.capture.formats.images import ExpectedSize, check_memory
 from splinecli.capture.formats.normal_files import read_depth
+from splinecli.capture.lamp_files import read_camera_matrix
 from splinecli.capture.linearise import parse_window
-from splinecli.capture.near_lamps import read_camera_matrix
 from splinecli.errors import InputError, SplinecliError
 from splinecli.maths import Float64Array, Floats, Picture
 from splinecli.maths.normals import Convention, encode_picture

@@ -25,7 +25,7 @@ from splinecli.capture.formats.images import (
     read_mask,
     to_linear,
 )
-from splinecli.capture.near_lamps import read_camera_matrix
+from splinecli.capture.lamp_files import read_camera_matrix
 from splinecli.capture.roles import choose_mask
 from splinecli.errors import InputError
 from splinecli.lights.calibration.circle import (
