@@ -5,7 +5,7 @@ looks like a hollow under lights with x and y negated: shading, attached shadows
 curl of the normals are the same, but cast shadows and the outline differ. In addition, the heights
 of a surface may be scaled if its lights are lowered or raised accordingly. This generalised
 bas-relief ambiguity preserves all shadows (Belhumeur, Kriegman and Yuille, "The bas-relief
-ambiguity", IJCV 1999), so the network has to resolve it.
+ambiguity", IJCV 1999), but it makes the albedo depend on the slope.
 
 The outline of the object reveals a common rotation of lights and normals; see outline.py.
 
