@@ -167,7 +167,7 @@ class TrialSource:
     rows: NDArray[np.integer] | None = None
 
     def see(self, trial: Trial, *, whole: bool = False) -> Capture:
-        """Return the capture under the lights of a trial, with noise, refined or estimated if
+        """Return the capture under a trial's lights, which are disturbed, refined or estimated as
         required.
 
         It contains the scored pixels or, with `whole`, all pixels. As in `infer`, lights are

@@ -63,7 +63,9 @@ def plane_slopes(
 def level_heights(
     heights: Floats, slopes: tuple[float, float], *, aspect: float = 1.0
 ) -> Float64Array:
-    """Return heights (H, W) minus a plane with these slopes, whose mean on the object is 0."""
+    """Return heights (H, W) after subtracting a plane with these slopes and a mean of 0 on the
+    object.
+    """
     rows, columns = np.indices(heights.shape)
     plane = np.asarray(slopes[0] * columns - slopes[1] * aspect * rows, np.float64)
     return np.asarray(heights - (plane - plane[np.isfinite(heights)].mean()), np.float64)

@@ -195,8 +195,8 @@ def _to_normals(
 ) -> Float32Array:
     """Return unit vectors (H, W, 3), zero outside the mask (H, W).
 
-    Colours must have about unit length as vectors; with check_floats, also floating-point values.
-    Raises InputError for values that are not normals.
+    As vectors, colours must have about unit length, and with check_floats also floating-point
+    values. Raises InputError for values that are not normals.
     """
     values = stored.values
     if values.dtype.kind not in "fiu":

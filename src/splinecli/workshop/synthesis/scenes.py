@@ -91,9 +91,7 @@ def render_direct(
 def _view_cosines(
     visible: VisibleSurface, pixels: NDArray[np.int64], normals: Tensor, directions: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return n.v (N, 1) and l.v, (F) or (N, F), of the samples of some pixels with unit normals (N,
-    3).
-    """
+    """Return n.v (N, 1) and l.v, (F) or (N, F), for samples of pixels with unit normals (N, 3)."""
     if visible.back is None:
         return normals[:, 2:], directions[:, 2]
     count = visible.samples_per_pixel

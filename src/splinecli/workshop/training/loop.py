@@ -211,7 +211,7 @@ def start_network(weights: str, network: SplineNet) -> None:
 
 
 def _covers(wanted: Any, found: Any) -> bool:
-    """Return whether a setting of the refinement nets (one or several numbers) is at least another
+    """Return whether a setting of the refinement nets, one number or several, is at least another
     one.
     """
     return all(one >= other for one, other in zip(np.ravel(wanted), np.ravel(found), strict=True))
