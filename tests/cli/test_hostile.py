@@ -174,7 +174,7 @@ def test_memory_that_runs_out_is_one_line(capture, make_capture, run, monkeypatc
     monkeypatch.setattr(cv2, "imdecode", Mock(wraps=cv2.imdecode, side_effect=decoded))
     result = run(f"infer {capture} second --method ls -q", code=1)
     message = (
-        "splinecli: sphere: not enough memory is available. Close other programs, or use smaller"
+        "splinecli: sphere: there is not enough memory. Close other programs, or use smaller"
         " images.\n"
     )
     assert result.err == message

@@ -74,7 +74,7 @@ def test_an_index_of_several_captures(capture, make_capture, run):
     Path("out").mkdir()
     Path("out/index.html").write_text("<html>my site</html>", "utf-8")
     captures = ("infer sphere broken --method ls --html", "a b")
-    run(*captures, code=5, says="index.html: was not written by splinecli")
+    run(*captures, code=5, says="index.html: the file was not written by splinecli")
     Path("out/index.html").unlink()
     run(*captures, code=3)
     index = Path("out/index.html").read_text("utf-8")
@@ -117,7 +117,7 @@ REFUSED_ARGUMENTS = """
 --lights none.txt | 3 | none.txt: the file does not exist.
 --mask none.png | 3 | none.png: the file does not exist.
 --flat-field none | 3 | none: the folder does not exist.
---maps albedo,depth | 2 | --maps has 'depth'
+--maps albedo,depth | 2 | --maps contains 'depth'
 --transfer rec709 | 2 | 'rec709'; expected auto, linear, srgb, or gamma:G with G from 0.1 to 10
 --white-level 0 | 2 | --white-level is '0'; expected a number above 0
 --weights spline-net | 2 | method ls does not use weights

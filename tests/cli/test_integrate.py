@@ -375,7 +375,7 @@ def test_a_damaged_report_is_named(run, capture):
         problem = (
             " is damaged"
             if key in ("files", "file_sizes")
-            else ": is damaged, or from another version"
+            else ": the report is damaged, or from another version"
         )
         result = run(f"integrate {path.parent} -o again", code=3, says=f"report.json{problem}")
         assert result.err.count("\n") == 1

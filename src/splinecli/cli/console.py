@@ -48,7 +48,7 @@ def explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, ParserError):
         return _usage_message(error), UsageError.exit_code
     if is_out_of_memory(error):
-        problem = "not enough memory is available. Close other programs, or use smaller images."
+        problem = "there is not enough memory. Close other programs, or use smaller images."
         return problem, SplinecliError.exit_code
     if isinstance(error, OSError):
         return explain(as_splinecli_error(error))

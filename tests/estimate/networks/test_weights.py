@@ -156,7 +156,7 @@ def test_nothing_is_unpickled(tmp_path):
         with pytest.raises(ModelError, match="not a safetensors file"):
             resolve_weights(str(path))
     assert not (tmp_path / "exploded").exists()
-    with pytest.raises(ModelError, match="is a folder"):
+    with pytest.raises(ModelError, match="found a folder"):
         resolve_weights(str(tmp_path))
 
 

@@ -34,7 +34,7 @@ def test_round_trip_through_json(name):
     [
         (
             {"stepz": 5},
-            "unknown training setting 'stepz'; known are angle_weight, asymmetric_weight",
+            "unknown training setting 'stepz', expected one of angle_weight, asymmetric_weight",
         ),
         ({"network": {"lights": 5}}, "unknown network setting 'lights'"),
         ({"pixels": ["wall_share"]}, "'pixels' is .* expected a table of settings"),

@@ -312,9 +312,7 @@ def test_a_checkpoint_of_another_version_or_kind_is_refused(trainer, tmp_path):
     path = tmp_path / CHECKPOINT
     whole = path.read_bytes()
     save_weights(trainer.network, path)
-    with pytest.raises(
-        ModelError, match="found splinecli-weights-1, expected splinecli-checkpoint-2"
-    ):
+    with pytest.raises(ModelError, match="found the format splinecli-weights-1, expected"):
         read_checkpoint_config(path)
     # The checksum does not cover the header. The new text has the same length, so that the header
     # stays valid.
