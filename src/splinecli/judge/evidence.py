@@ -34,7 +34,7 @@ from splinecli.maths import Float64Array, Floats
 from splinecli.maths.normals import unit
 from splinecli.maths.robust import solve_each
 
-_COARSE_PIXELS = 3000
+_COARSE_PIXELS, _COARSE_VALUES = 3000, 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,8 @@ class Evidence:
     @cached_property
     def coarse(self) -> Evidence:
         """The evidence of fewer pixels, for measures that are taken after each reading."""
-        step = int(np.ceil(np.sqrt(len(self.sample.observations) / _COARSE_PIXELS)))
+        most = min(_COARSE_PIXELS, _COARSE_VALUES // len(self.indices))
+        step = int(np.ceil(np.sqrt(len(self.sample.observations) / most)))
         if step < 2:
             return self
         part = np.zeros_like(self.sample.mask)
@@ -167,7 +168,7 @@ class Evidence:
             self.sample.mask[::step, ::step],
             self.sample.step * step,
         )
-        return replace(self, sample=sample, lamps=None)
+        return replace(self, sample=sample, closeup=sample, lamps=None)
 
     @cached_property
     def shares(self) -> dict[str, float]:
@@ -348,11 +349,11 @@ class Evidence:
                 linear = np.maximum(stored - constant_light(stored, lights, reading.amount), 0)
             return replace(sample, observations=linear / stated)
 
-        sample, closeup = mended(self.sample), mended(self.closeup)
+        sample = mended(self.sample)
         return replace(
             self,
             sample=sample,
-            closeup=closeup,
+            closeup=sample if self.closeup is self.sample else mended(self.closeup),
             accepted=accepted,
             linear=self.linear and reading.kind != "curve",
             curve=reading.amount if reading.kind == "curve" else self.curve,
