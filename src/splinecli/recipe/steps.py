@@ -23,12 +23,13 @@ from splinecli.capture.source import CaptureSource, Source
 from splinecli.errors import InputError
 from splinecli.images.alignment import MIN_IMAGES
 from splinecli.images.lamps import estimate_light_intensities, lamp_colours
-from splinecli.images.lens_blur import remove_blur, surroundings
+from splinecli.images.lens_blur import are_soft, remove_blur, surroundings
 from splinecli.images.mask import find_object
 from splinecli.images.saturation import restore_saturated
 from splinecli.judge.checks import ALIGN_ADVICE, check_capture
 from splinecli.judge.explanations import SRGB_EXPONENT
 from splinecli.lights.light_fit import refine_capture
+from splinecli.lights.outline import is_outlined
 from splinecli.maths import Float64Array
 from splinecli.maths.transfer import SRGB
 from splinecli.recipe.reading import Observed, exposure_warnings, read_observations
@@ -45,6 +46,7 @@ from splinecli.records.capture_warnings import (
     WarningKind,
     estimated_lights,
     lights_mended,
+    soft_images,
 )
 from splinecli.system.files import StrPath
 
@@ -117,7 +119,11 @@ def observe(work: Work, advance: Callable[[], object]) -> Work:
     lamps, of_lamps = source.near_lamps(mask)
     of_mask = source.mask_warnings(mask, indices)
     exposure = exposure_warnings(observed, inverted=bool(of_mask))
-    blur = None if around is None else remove_blur(observed.observations, mask, around)
+    blur, soft = None, list[CaptureWarning]()
+    if around is not None:
+        if is_outlined(mask) and are_soft(observed.observations, mask, around):
+            soft = [soft_images()]
+        blur = remove_blur(observed.observations, mask, around)
     capture = Capture(
         source.name,
         observed.observations[: observed.saturation.n_pixels],
@@ -125,7 +131,7 @@ def observe(work: Work, advance: Callable[[], object]) -> Work:
         indices,
         mask,
         truth,
-        (*source.warnings, *work.warnings, *exposure, *of_truth, *of_lamps, *of_mask),
+        (*source.warnings, *work.warnings, *exposure, *soft, *of_truth, *of_lamps, *of_mask),
         estimated_colours=work.colours,
         white_level=observed.saturation.white_level,
         removed_blur=blur,

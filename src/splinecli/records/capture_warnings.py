@@ -325,6 +325,11 @@ SETTINGS_READ = WarningKind(
 SATURATED = WarningKind(
     "saturated", "Over 1 % of the observations are saturated", "Use a shorter exposure"
 )
+SOFT_IMAGES = fault(
+    "soft_images",
+    "The outline and all shadows are [blurred](image-preparation.md#lens-blur) by 2 pixels or more",
+    "Photograph the object again, in focus",
+)
 UNEQUAL_INTENSITIES = fault(
     "unequal_intensities",
     "Light intensities look unequal, but the images do not determine them; or given intensities"
@@ -351,6 +356,8 @@ WARNINGS = {kind.code: kind for kind in list(globals().values()) if isinstance(k
 # faults of the light directions that are mended if they are clear
 FAULTS_OF_LIGHTS = frozenset({LIGHT_FRAME, LIGHT_ORDER, LIGHTS_TILTED})
 PROBABLY_WRONG = frozenset(code for code, kind in WARNINGS.items() if kind.is_error)
+# median error of normals behind a blur of 2 to 4 pixels
+SOFT_DEG = 4.0
 # share of saturated observations above which the capture, or an image, carries a warning
 SATURATED_SHARE = 0.01
 
@@ -362,6 +369,16 @@ def mask_inverted(name: str) -> CaptureWarning:
         " probably inverted."
     )
     return CaptureWarning(MASK_INVERTED, f"{text} A mask is white on the object.")
+
+
+def soft_images() -> CaptureWarning:
+    """Warn that the images are too blurred to be sharpened."""
+    text = (
+        "The images are blurred: no edge of a shadow, and no part of the outline, is sharper than"
+        " about 2 pixels. Sharpening cannot undo this: photograph the object again, in focus and"
+        " with a smaller aperture."
+    )
+    return CaptureWarning(SOFT_IMAGES, text, SOFT_DEG)
 
 
 def lights_mended(cause: str, *, in_files: bool = True) -> CaptureWarning:
