@@ -146,6 +146,9 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         ),
         ("weights", f"spline-net, SHA-256 {report['weights']['spline-net'][:16]}..."),
     ]
+    if report["light_directions"]:
+        text = "what only the normals of the network show; infer checks it, and may correct a tilt"
+        rows.append(("not checked", text))
     if "mended_lights" in report:
         nothing = "not written, because no other reading of the lights fits clearly better"
         rows.append(("mended", report["mended_lights"] or nothing))
