@@ -110,6 +110,15 @@ def test_what_shows_no_object_is_refused():
             find_lights(observations.astype(np.float32), mask, True)
 
 
+def test_a_ball_of_light_and_highlight_is_not_returned_as_a_hollow():
+    """Its brightness is constant but for a wide highlight, as no trained material's is."""
+    true = ring_lights(8, 50)
+    towards = unit(true + np.array((0, 0, 1)))
+    values = 0.05 + np.exp(20 * (NORMALS[INSIDE] @ towards.T - 1))
+    with pytest.raises(InputError, match="bump or a hollow"):
+        find_lights(values.astype(np.float32), INSIDE, False)
+
+
 def test_a_first_light_from_another_side_decides_nothing():
     true = lights()
     true[0] = (0.0, 0.6, 0.8)

@@ -180,7 +180,7 @@ def find_lights(
         raise _open_question(mask, first_image)
     if refuse and (expected := float(errors_deg.mean())) > LARGEST_ERROR_DEG:
         raise InputError(
-            f"the images do not determine the lights: their estimated error is {expected:.0f}"
+            f"the images do not determine the lights: their estimated error is {expected:.1f}"
             f" degrees, expected at most {LARGEST_ERROR_DEG:.0f}",
             hint="Photograph the whole outline of the object and pass its mask, add images with"
             " other lights, or measure the lights with 'splinecli calibrate'",
@@ -262,15 +262,36 @@ def _bump_or_hollow(
     # If the outline is visible, the network seldom confuses bumps with hollows: never on 113
     # rendered captures with expected errors below 14 degrees, but on three of nine above 20.
     # Without an outline, its guess is random.
-    if is_outlined(mask):
-        log_odds += max(0.7, 7.0 - 0.25 * expected_deg)
-    directions = directions * OPPOSITE if log_odds < 0 else directions
-    return directions, 1 / (1 + math.exp(min(abs(log_odds), 500.0)))
+    network = max(0.7, 7.0 - 0.25 * expected_deg) if is_outlined(mask) else 0.0
+    sign = -1.0 if log_odds + network < 0 else 1.0
+    directions = directions * OPPOSITE if sign < 0 else directions
+    # A hollow is only certain with other evidence, because the network mistook a ball of an
+    # unknown material for one.
+    if _looks_hollow(observations, mask, directions):
+        network = 0.0
+    return directions, 1 / (1 + math.exp(min(sign * (log_odds + network), 500.0)))
+
+
+def _looks_hollow(observations: Float32Array, mask: Bools, directions: Float64Array) -> bool:
+    """Return whether the side of the object opposite to the light is clearly the brighter one."""
+    rows, columns = np.nonzero(mask)
+    places = np.stack((columns - columns.mean(), rows.mean() - rows), axis=1)
+    places /= math.sqrt(len(rows) / math.pi)  # in radii
+    values = observations / np.maximum(observations.mean(axis=0), 1e-9)
+    values = np.minimum(values, np.quantile(values, 0.995, axis=0))
+    shifts = values.T @ places / len(places)
+    shifts -= shifts.mean(axis=0)
+    sides = directions[:, :2] - directions[:, :2].mean(axis=0)
+    scale = np.linalg.norm(shifts) * np.linalg.norm(sides)
+    return bool(np.abs(shifts).mean() > 0.05 and (shifts * sides).sum() < -0.7 * scale)
 
 
 def _open_question(mask: Bools, first_image: str) -> InputError:
     problem = "the images do not show whether the object is a bump or a hollow"
-    whole = "If the images show the whole object, pass its mask with --mask FILE. Otherwise, state"
+    whole = (
+        "If the images show the whole object, pass its mask with --mask FILE or, before a darker"
+        " background, add --auto-mask. Otherwise, state"
+    )
     return InputError(
         f"{problem}, because both look the same under opposite lights",
         hint=f"{'State' if is_outlined(mask) else whole} where the light of {first_image} comes"

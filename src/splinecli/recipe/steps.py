@@ -313,8 +313,7 @@ def _finds_mask(work: Work) -> bool:
 
 def _needs_outline(work: Work) -> bool:
     """Whether a mask is tried, because the outline helps to estimate lights."""
-    options = work.options
-    return work.finds_lights and options.refuses_lights and options.first_light is None
+    return work.finds_lights and work.options.refuses_lights
 
 
 def _used(work: Work) -> int:
