@@ -280,7 +280,7 @@ def with_smooth_outline(mesh: SurfaceMesh) -> SurfaceMesh:
     following, preceding = np.arange(count), np.arange(count)
     following[start[once[start]]] = end[once[start]]
     preceding[end[once[end]]] = start[once[end]]
-    places = np.hstack((mesh.vertices, mesh.uvs))
+    places: Floats = np.hstack((mesh.vertices, mesh.uvs))
     for _ in range(_OUTLINE_ROUNDS):
         places = places / 2 + (places[preceding] + places[following]) / 4
     return replace(mesh, vertices=places[:, :3], uvs=places[:, 3:])

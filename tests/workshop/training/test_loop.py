@@ -330,5 +330,5 @@ def test_a_checkpoint_of_another_version_or_kind_is_refused(trainer, tmp_path):
     path.write_bytes(
         whole.replace(b"batch_size", b"batch size").replace(b'\\"seed\\": 0', b'\\"seed\\"  0')
     )
-    with pytest.raises(ModelError, match="the entry 'config' in the file is not JSON"):
+    with pytest.raises(ModelError, match="the entry 'config' in the file is not valid"):
         read_checkpoint_config(path)
