@@ -20,11 +20,12 @@ from splinecli.maths.normals import unit
 from splinecli.workshop.synthesis.batches import add_sensor_noise
 from wrong_lights import FRAMES
 
-LIGHTS = ("light_frame", "light_order")  # under a ring, a shift of the order is a rotation
+OTHER = "lights_contradicted"
+LIGHTS = ("light_frame", "light_order", OTHER)  # under a ring, a shift of the order is a rotation
 CURVE, NEAR = "nonlinearity_suspected", "near_lights_suspected"
 FAULTS: dict[str, tuple[Sequence[str], Sequence[str]]] = {
-    "tilt": (("5", "15", "30"), ("lights_tilted",)),
-    "elevation": (("0.4", "0.65", "0.85", "1.4", "2"), ("elevation_suspected",)),
+    "tilt": (("5", "15", "30"), ("lights_tilted", OTHER)),
+    "elevation": (("0.4", "0.65", "0.85", "1.4", "2"), ("elevation_suspected", OTHER)),
     "near": (("2", "3", "5"), (NEAR,)),
     "encoded": (("gamma1.8", "gamma2.2", "srgb"), (CURVE,)),
     "encoded_unequal": (("gamma1.8", "gamma2.2", "srgb"), (CURVE,)),
@@ -34,8 +35,8 @@ FAULTS: dict[str, tuple[Sequence[str], Sequence[str]]] = {
     "inverted": (("0.5",), ("unequal_intensities",)),
     "frame": (("x negated", "y negated", "x and y exchanged", "x and y negated"), LIGHTS),
     "order": (("shifted", "reversed", "interleaved"), LIGHTS),
-    "half_vectors": (("1",), ("light_frame", "elevation_suspected")),
-    "zenith": (("1",), ("light_frame", "elevation_suspected")),
+    "half_vectors": (("1",), ("light_frame", "elevation_suspected", OTHER)),
+    "zenith": (("1",), ("light_frame", "elevation_suspected", OTHER)),
     "rotated": (("30",), LIGHTS),
     "moved_one": (("6",), ("images_shifted", "image_inconsistent")),
     "moved_half": (("6",), ("images_shifted",)),

@@ -23,13 +23,15 @@ from splinecli.estimate.methods import DEFAULT_METHOD
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import resolve_weights
 from splinecli.lights.least_curl import OPPOSITE, BestLights, Lights
-from splinecli.maths import Bools, Float64Array, Floats
+from splinecli.maths import Bools, Float64Array, Floats, Integers
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.pixel_grid import Blocks
 from splinecli.system.machine import in_order, one_thread_each
 
 _GRID_PIXELS, _MOST_LIGHTS = 500, 30
 _STEPS, _STEP, _OWN_STEP = 14, 0.06, 0.01  # in common, and of each light by itself
+# for a doubt about given lights
+_FEW_PIXELS, _FEW_STEPS, _DOUBT_DEG = 250, 8, 10.0
 # Weights, in units of the logarithm of the expected error: of the curl of the normals, of the
 # distance from the start, and of the spread of the albedo, which unknown intensities would tilt
 # (Alldrin, Mallick and Kriegman, "Resolving the generalized bas-relief ambiguity by entropy
@@ -58,7 +60,7 @@ def best_lights(
     with errors of its own, is a weak witness. Bump and hollow are equal.
     """
     count = observations.shape[1]
-    used = np.linspace(0, count - 1, min(count, _MOST_LIGHTS)).astype(int)
+    used = _some_lights(count)
     images = _Images.of(observations[:, used], mask)
     errors = torch.tensor(np.radians(errors_deg[used]), dtype=torch.float32)
     follow = partial(_follow, images, errors, intensities_known=intensities_known)
@@ -99,29 +101,74 @@ def best_lights(
     return BestLights(lights, best, found[best].expected, found[best].curl)
 
 
+def _some_lights(count: int) -> Integers:
+    return np.linspace(0, count - 1, min(count, _MOST_LIGHTS)).astype(int)
+
+
+@dataclass(frozen=True, eq=False)
+class LightWitness:
+    """What the network says of the given lights (F, 3) of images, and of others."""
+
+    images: _Images
+    used: Integers
+    given: Float64Array  # (F, 3)
+
+    @classmethod
+    def of(cls, observations: Floats, mask: Bools, given: Float64Array) -> LightWitness:
+        """Return the witness of observations (P, F), which were divided by the intensities."""
+        used = _some_lights(len(given))
+        return cls(_Images.of(observations[:, used], mask, _FEW_PIXELS), used, given)
+
+    def cost(self, directions: Float64Array) -> float:
+        """Return the logarithm of the errors that the network expects under lights (F, 3), plus
+        that of the curl of its normals, weighted.
+        """
+        lights = torch.tensor(directions[self.used], dtype=torch.float32)
+        with torch.inference_mode(), one_thread_each():
+            expected, curl, _ = self.images.judge(lights, lights.new_zeros(len(lights)))
+        return _Followed(Lights(directions, directions), expected.item(), curl.item()).cost
+
+    def descend(self, *, intensities_known: bool) -> tuple[float, float]:
+        """Return how much lower the cost is under better lights near the given ones, and their mean
+        distance in degrees from these.
+        """
+        given = self.given[self.used]
+        errors = torch.full((len(given),), np.radians(_DOUBT_DEG), dtype=torch.float32)
+        start = Lights(given, np.ones(len(given)))
+        with one_thread_each():
+            better = _follow(
+                self.images, errors, start, intensities_known=intensities_known, steps=_FEW_STEPS
+            )
+        moved_deg = float(angle_between_deg(better.lights.directions, given).mean())
+        return self.cost(self.given) - better.cost, moved_deg
+
+
 class _Followed(NamedTuple):
     lights: Lights
     expected: float
     curl: float
 
+    @property
+    def cost(self) -> float:
+        return float(self.expected + _CURL * np.log(self.curl + 0.02))
+
 
 @dataclass(frozen=True, eq=False)
 class _Images:
-    """Images on a coarse grid, and the neighbours of its inner pixels."""
+    """The bright pixels of images on a coarse grid, and the neighbours of inner ones."""
 
     values: Tensor  # (p, F)
-    bright: Tensor  # (p,) bool
     neighbours: Tensor  # (5, n): the pixels themselves, those right and left, above and below
 
     @classmethod
-    def of(cls, observations: Floats, mask: Bools) -> _Images:
-        blocks = Blocks.over(mask, _GRID_PIXELS)
+    def of(cls, observations: Floats, mask: Bools, most: int = _GRID_PIXELS) -> _Images:
+        blocks = Blocks.over(mask, most)
         values = blocks.average(observations, mask)
         brightest = values.max(axis=1)
         typical = np.quantile(brightest, 0.99)
         bright = brightest > 0.05 * typical
         numbers = np.full(np.add(blocks.mask.shape, 2), -1)
-        numbers[1:-1, 1:-1][blocks.mask] = np.where(bright, np.arange(len(values)), -1)
+        numbers[1:-1, 1:-1][blocks.mask] = np.where(bright, np.cumsum(bright) - 1, -1)
         middle = numbers[1:-1, 1:-1]
         around = (
             middle,
@@ -132,8 +179,8 @@ class _Images:
         )
         neighbours = np.stack([each.ravel() for each in around])
         neighbours = neighbours[:, (neighbours >= 0).all(axis=0)]
-        scaled = torch.tensor(values / max(float(typical), 1e-12), dtype=torch.float32)
-        return cls(scaled, torch.from_numpy(bright), torch.from_numpy(neighbours))
+        scaled = values[bright] / max(float(typical), 1e-12)
+        return cls(torch.tensor(scaled, dtype=torch.float32), torch.from_numpy(neighbours))
 
     def judge(self, directions: Tensor, log_intensities: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the mean logarithm of the errors that the network expects under lights, the curl
@@ -145,9 +192,9 @@ class _Images:
         # Shadows and highlights are dark and bright outliers.
         lit = (cosines > _LEAST_COSINE).float()
         fitted = (lit * observed * cosines).sum(dim=1) / (lit * cosines**2).sum(dim=1).clamp(1e-6)
-        albedo = fitted[self.bright].clamp(min=1e-6).log()
+        albedo = fitted.clamp(min=1e-6).log()
         spread = (albedo - albedo.median()).abs().mean()
-        return error[self.bright, 0].mean(), self._curl(normals), spread
+        return error[:, 0].mean(), self._curl(normals), spread
 
     def _curl(self, normals: Tensor) -> Tensor:
         if not self.neighbours.shape[1]:
@@ -174,7 +221,12 @@ def _network() -> SplineNet:
 
 
 def _follow(
-    images: _Images, errors: Tensor, start: Lights, *, intensities_known: bool
+    images: _Images,
+    errors: Tensor,
+    start: Lights,
+    *,
+    intensities_known: bool,
+    steps: int = _STEPS,
 ) -> _Followed:
     """Return the best lights on the way of a gradient descent (Adam, Kingma and Ba, ICLR 2015) from
     a start. All lights move together by a matrix, and each a little by itself.
@@ -185,12 +237,12 @@ def _follow(
     common, own = torch.zeros(3, 3, requires_grad=True), torch.zeros_like(began, requires_grad=True)
     logs = torch.tensor(np.log(start.intensities), dtype=torch.float32)
     own_logs = torch.zeros_like(logs, requires_grad=not intensities_known)
-    steps = {common: _STEP, own: _OWN_STEP}
+    sizes = {common: _STEP, own: _OWN_STEP}
     if not intensities_known:
-        steps[own_logs] = 2 * _OWN_STEP
-    descent = torch.optim.Adam([{"params": [each]} for each in steps], betas=(0.7, 0.9))
+        sizes[own_logs] = 2 * _OWN_STEP
+    descent = torch.optim.Adam([{"params": [each]} for each in sizes], betas=(0.7, 0.9))
     best, least = _Followed(start, 0.0, 1.0), np.inf
-    for number in range(_STEPS + 1):
+    for number in range(steps + 1):
         vectors = began @ (torch.eye(3) + common) + own
         lights = normalize(vectors, dim=1)
         relative = logs
@@ -210,9 +262,9 @@ def _follow(
                 unit(lights.detach().double().numpy()), relative.detach().double().exp().numpy()
             )
             best = _Followed(found, expected.item(), curl.item())
-        if number < _STEPS:
-            share = 0.53 + 0.5 * np.cos(np.pi * number / (_STEPS + 1))
-            for group, step in zip(descent.param_groups, steps.values(), strict=True):
+        if number < steps:
+            share = 0.53 + 0.5 * np.cos(np.pi * number / (steps + 1))
+            for group, step in zip(descent.param_groups, sizes.values(), strict=True):
                 group["lr"] = step * share
             descent.zero_grad()
             cost.backward()  # type: ignore[no-untyped-call]

@@ -441,6 +441,7 @@ class Remedy:
 
     faults: tuple[Finding, ...]
     lights: Float64Array | None = None  # (F, 3); None as given
+    light_error_deg: float | None = None  # of lights that were estimated from the images
     curve: float | None = None  # the exponent of the transfer curve; None as given
     align: bool = False  # whether images are aligned
 
@@ -503,7 +504,10 @@ def _remedy(given: Evidence, seen: Evidence, faults: tuple[Finding, ...]) -> Rem
     """Return how the given evidence becomes the evidence in which faults are mended."""
     differ = given.indices == seen.indices and (given.directions != seen.directions).any()
     return Remedy(
-        faults, seen.directions if differ else None, seen.curve, bool(seen.moved - given.moved)
+        faults,
+        seen.directions if differ else None,
+        curve=seen.curve,
+        align=bool(seen.moved - given.moved),
     )
 
 

@@ -41,6 +41,7 @@ from splinecli.records.capture_warnings import (
     EIGHT_BIT,
     FAULTS_OF_LIGHTS,
     LIGHTS_TILTED,
+    LIGHTS_UNCERTAIN,
     NOT_DISTILLED,
     ROUGH_LIGHTS,
     UNTRAINED_LIGHTS,
@@ -227,7 +228,9 @@ def estimate_capture(
         for text in estimator.warn_of_lights(capture.n_lights)
     ]
     # Other warnings about errors already explain a low confidence.
-    if not any(warning.error_deg and warning.is_error for warning in warnings):
+    if not any(
+        each.error_deg and (each.is_error or each.kind is LIGHTS_UNCERTAIN) for each in warnings
+    ):
         warnings += check_confidence(estimate.expected_under_5)
     refuse_if_strict(warnings, capture.name, strict=strict, mended=mended)
     estimate = replace(estimate, capture=replace(estimate.capture, warnings=tuple(warnings)))

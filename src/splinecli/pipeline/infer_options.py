@@ -656,6 +656,7 @@ class InferOptions(ReadingOptions, frozen=True, kw_only=True):
         return dataclasses.replace(
             super().recipe,
             as_stored=self.as_stored,
+            asks_network=self.method.startswith(DEFAULT_METHOD) and not self.as_stored,
             mends=not (self.as_stored or self.strict),
             auto_mask=self.auto_mask,
             refine_lights=self.refine_lights,

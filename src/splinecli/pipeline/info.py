@@ -59,7 +59,11 @@ def describe_capture(
         reading = reading.with_settings(folder)
         source = reading.open(folder)
         _check_options(options, source)
-        work = begin(source, None, replace(reading.recipe, auto_mask=auto_mask))
+        work = begin(
+            source,
+            None,
+            replace(reading.recipe, auto_mask=auto_mask, asks_network=mended_lights is not None),
+        )
         n_reads = images_to_read(work)
         with observer.progress("reading", n_reads) as advance:
             work = follow(work, advance=lambda amount, _: advance(amount))

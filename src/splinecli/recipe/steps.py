@@ -32,6 +32,7 @@ from splinecli.lights.light_fit import refine_capture
 from splinecli.lights.outline import is_outlined
 from splinecli.maths import Float64Array
 from splinecli.maths.transfer import SRGB
+from splinecli.recipe.contradiction import ask_network
 from splinecli.recipe.reading import Observed, exposure_warnings, read_observations
 from splinecli.recipe.registration import compare_colours, register
 from splinecli.recipe.work import USUAL, RecipeOptions, Work
@@ -221,6 +222,8 @@ def restore(work: Work, _: Callable[[], object]) -> Work:
 def judge(work: Work, _: Callable[[], object]) -> Work:
     """Check the lights and the images against each other; see judge/checks.py."""
     judgement = check_capture(work.source, work.made, strict=work.options.strict)
+    if work.options.asks_network:
+        judgement = ask_network(work, judgement)
     return replace(work, judgement=judgement)
 
 
@@ -244,7 +247,8 @@ def mend(work: Work, _: Callable[[], object]) -> Work:
         directions[list(work.indices)] = remedy.lights
         source = replace(source, light_directions=directions)
         why = causes(*FAULTS_OF_LIGHTS)
-        notes.append(lights_mended(why, in_files=files is not None))
+        note = lights_mended(why, in_files=files is not None)
+        notes.append(replace(note, error_deg=remedy.light_error_deg))
     if remedy.curve is not None and files is not None and files.radiometry.automatic:
         curve = SRGB if remedy.curve == SRGB_EXPONENT else remedy.curve
         radiometry = replace(files.radiometry, curve=curve, automatic=False)

@@ -31,6 +31,7 @@ class RecipeOptions:
     first_light: str | None = None  # the side from which the first of these lights comes
     refuses_lights: bool = True  # raise InputError for lights that the images do not determine
     judges: bool = True  # check lights and images against each other
+    asks_network: bool = False  # compare given lights with others; see contradiction.py
     mends: bool = False  # mend faults that are clear
     keeps_lights: bool = False  # also faults of the lights, whose frame the user gave
     strict: bool = False  # also warn of properties that the images leave undetermined

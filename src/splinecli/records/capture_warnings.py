@@ -204,6 +204,12 @@ LIGHT_ORDER = fault(
     "The order of the lights probably differs from that of the images",
     "Correct the light file",
 )
+LIGHTS_CONTRADICTED = fault(
+    "lights_contradicted",
+    "The images clearly fit [other lights](input-checks.md#wrong-light-directions) than the given"
+    " ones",
+    "Check their frame, order and elevations, or use `info --mended-lights`",
+)
 LIGHTS_FOUND = WarningKind(
     "lights_found",
     "The light directions were read from a file with an unusual name or place, or from the [names"
@@ -245,6 +251,12 @@ LIGHTS_TILTED = fault(
     "lights_tilted",
     "All lights are probably [tilted together](input-checks.md#wrong-light-directions)",
     "Measure them in the frame of the camera, or use `info --mended-lights`",
+)
+LIGHTS_UNCERTAIN = WarningKind(
+    "lights_uncertain",
+    "The network expects smaller errors under [other"
+    " lights](input-checks.md#wrong-light-directions), so the confidence is lowered",
+    "Check the lights; none for unusual materials",
 )
 LOW_CONFIDENCE = fault(
     "low_confidence",
@@ -354,7 +366,9 @@ WHITE_LEVEL = WarningKind(
 
 WARNINGS = {kind.code: kind for kind in list(globals().values()) if isinstance(kind, WarningKind)}
 # faults of the light directions that are mended if they are clear
-FAULTS_OF_LIGHTS = frozenset({LIGHT_FRAME, LIGHT_ORDER, LIGHTS_TILTED})
+FAULTS_OF_LIGHTS = frozenset(
+    {ELEVATION_SUSPECTED, LIGHT_FRAME, LIGHT_ORDER, LIGHTS_CONTRADICTED, LIGHTS_TILTED}
+)
 PROBABLY_WRONG = frozenset(code for code, kind in WARNINGS.items() if kind.is_error)
 # median error of normals behind a blur of 2 to 4 pixels
 SOFT_DEG = 4.0

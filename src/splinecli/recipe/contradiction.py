@@ -1,0 +1,77 @@
+"""Given lights that contradict the images, according to the network that estimates normals.
+
+Under wrong lights the network expects larger errors, and its normals do not fit a surface (see
+estimate/light_descent.py). A tilt, another frame, wrong elevations or another order of the lights
+are one fact to this witness: some steps of its descent show whether better lights are near. If so,
+lights are estimated from the images alone (lights/unknown_lights.py), and compared with the given
+ones. Faults of the values, such as near lamps, are less expensive for the network if the lights
+are wrong, too, so they raise the threshold.
+
+The thresholds were chosen on rendered captures (benchmarks/judgement.py). On draws of seven
+photographed objects, whose lights were measured, the cost falls by 0.4 at most.
+"""
+
+from splinecli.judge.checks import WRITES_MENDED, Finding, Judgement, Remedy
+from splinecli.lights.unknown_lights import find_lights
+from splinecli.maths.normals import angle_between_deg
+from splinecli.recipe.work import Work
+from splinecli.records.capture_warnings import (
+    ELEVATION_SUSPECTED,
+    FAULTS_OF_LIGHTS,
+    LIGHTS_CONTRADICTED,
+    LIGHTS_UNCERTAIN,
+    CaptureWarning,
+)
+
+# falls of the cost: from which lights are estimated, which lowers the confidence, which is clear,
+# and which is clear although values were doubted
+_DOUBT, _UNCERTAIN, _CLEAR, _ANYWAY = 0.5, 0.8, 1.2, 2.0
+_LARGEST_ERROR_DEG, _TIMES = 12.0, 2.0  # of estimated lights, and how far away the given ones are
+
+
+def ask_network(work: Work, judgement: Judgement) -> Judgement:
+    """Return the judgement after the network compared the given lights with others. Lights that
+    were estimated, near lamps, and captures that are mended anyway are not compared.
+
+    Raises ModelError.
+    """
+    from splinecli.estimate.light_descent import LightWitness, best_lights
+
+    capture = work.made
+    near = capture.lamps is not None or capture.camera_matrix is not None
+    if near or capture.light_errors_deg is not None or judgement.remedy is not None:
+        return judgement
+    values, given = capture.observations, capture.light_directions
+    known = capture.estimated_intensities is None
+    witness = LightWitness.of(values, capture.mask, given)
+    fall, moved_deg = witness.descend(intensities_known=known)
+    if fall < _DOUBT:
+        return judgement
+    found = find_lights(values, capture.mask, known, best_lights, refuse=False)
+    of_found = witness.cost(given) - witness.cost(found.directions)
+    apart, stated = angle_between_deg(found.directions, given).mean(), found.errors_deg.mean()
+    others = [each for each in judgement.warnings if each.kind not in FAULTS_OF_LIGHTS]
+    least = _ANYWAY if any(each.is_error for each in others) else _CLEAR
+    if any(each.kind is ELEVATION_SUSPECTED for each in judgement.warnings):
+        least = _UNCERTAIN  # another witness
+    if of_found > least and stated < _LARGEST_ERROR_DEG and apart > _TIMES * stated:
+        cause = (
+            f"The lights of {work.source.lights_file.name} contradict the images, which fit lights"
+            f" that are {apart:.0f} degrees away on average, and known to {stated:.0f} degrees."
+        )
+        text = f"{cause} Check their frame, order and elevations; {WRITES_MENDED} writes those."
+        warning = CaptureWarning(LIGHTS_CONTRADICTED, text, float(apart))
+        finding = Finding(warning, clear=True, cause=cause)
+        remedy = Remedy((finding,), found.directions, light_error_deg=float(stated))
+        return judgement._replace(
+            warnings=(*others, warning), mended_lights=found.directions, remedy=remedy
+        )
+    if fall > _UNCERTAIN and not any(each.is_error for each in judgement.warnings):
+        text = (
+            f"Under lights that differ by {moved_deg:.0f} degrees on average, the network expects"
+            " smaller errors and finds a better surface. The given lights may be inaccurate, or the"
+            " material is unusual; the confidence is lowered."
+        )
+        warning = CaptureWarning(LIGHTS_UNCERTAIN, text, moved_deg / 2)
+        return judgement._replace(warnings=(*judgement.warnings, warning))
+    return judgement
