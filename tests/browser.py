@@ -2,16 +2,12 @@
 none.
 """
 
-from __future__ import annotations
-
 import shutil
 import warnings
-from typing import TYPE_CHECKING, Any
 
 import pytest
 
-if TYPE_CHECKING:
-    from playwright.sync_api import Page
+from scenes import put
 
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 """Names of the system's Chromium on the path."""
@@ -35,7 +31,7 @@ HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
 """
 
 
-def find_chromium() -> str | None:
+def find_chromium():
     """Return the path of the system's Chromium, or None."""
     return next(filter(None, map(shutil.which, PROGRAMS)), None)
 
@@ -74,14 +70,11 @@ def open_page(browser, tmp_path):
     """open_page(html, fragment="", *, width=800, height=600, webgl=True) opens HTML from a file, as
     a reader does; errors of the page's script fail the test.
     """
-    opened: list[Any] = []
-    problems: list[str] = []
+    opened, problems = [], []
 
-    def open_html(
-        html: str, fragment: str = "", *, width: int = 800, height: int = 600, webgl: bool = True
-    ) -> Page:
+    def open_html(html, fragment="", *, width=800, height=600, webgl=True):
         path = tmp_path / f"page{len(opened)}.html"
-        path.write_text(html, "utf-8")
+        put(path, html)
         context = browser.new_context(viewport={"width": width, "height": height})
         opened.append(context)
         context.set_default_timeout(PATIENCE_MS)
@@ -93,7 +86,7 @@ def open_page(browser, tmp_path):
         page.goto(f"{path.as_uri()}#{fragment}")
         return page
 
-    def check_request(url: str) -> None:
+    def check_request(url):
         if not url.startswith(("file:", "data:")):
             problems.append(f"the page asks for {url}")
 

@@ -9,11 +9,11 @@ from pathlib import Path
 # one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from browser import browser, open_page
-from scenes import cap_directions, directions_at, shade, spiral_lights
+from scenes import cap_directions, directions_at, put, shade, spiral_lights
 from small_pixel_sets import make_set
 from splinecli.system.progress import STAGES
 
@@ -36,11 +36,24 @@ def no_lines_of_progress(monkeypatch):
 
 
 @pytest.fixture
+def rng():
+    return default_rng(0)
+
+
+@pytest.fixture
 def no_pictures(monkeypatch):
     """Save training runs without drawing the figures, which takes longer than the run itself."""
     monkeypatch.setattr(
         "splinecli.workshop.training.run_files.RunLog.draw", lambda self, maps: None
     )
+
+
+@pytest.fixture
+def coarse_shapes(monkeypatch):
+    """Drawn shapes of few triangles, which small pictures show as well."""
+    pytest.importorskip("embreex")
+    monkeypatch.setattr("splinecli.workshop.synthesis.shapes.SPACING", 0.04)
+    monkeypatch.setattr("splinecli.workshop.synthesis.shapes.FEWEST_FACES", 100)
 
 
 @pytest.fixture(scope="session")
@@ -60,7 +73,7 @@ def matte_pixels():
     no shadow among them.
     """
     normals, lights = cap_directions(200, 50), spiral_lights(12)
-    albedo = np.random.default_rng(1).uniform(0.01, 100, (200, 1))
+    albedo = default_rng(1).uniform(0.01, 100, (200, 1))
     return normals, lights, albedo * (normals @ lights.T)
 
 
@@ -85,7 +98,7 @@ def golden(request):
         path = GOLDEN / name
         text = _without_measurements(text)
         if request.config.getoption("--update-golden"):
-            path.write_text(text, "utf-8")
+            put(path, text)
         assert text == path.read_text("utf-8")
 
     return check

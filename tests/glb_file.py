@@ -3,39 +3,44 @@
 import io
 import json
 import struct
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
+
+from scenes import assert_unit
 
 _TYPES = {5126: ("<f4", 4), 5125: ("<u4", 4)}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
-def read_glb(content: bytes) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def read_glb(content):
     """Return the tree of a GLB file, and the arrays of its only mesh: attributes, "indices" and
     textures.
     """
     magic, version, length, json_length, json_kind = struct.unpack("<4sIIII", content[:20])
-    assert (magic, version, length, json_kind) == (b"glTF", 2, len(content), 0x4E4F534A)
+    assert magic == b"glTF"
+    assert version == 2
+    assert length == len(content)
+    assert json_kind == 0x4E4F534A
     tree = json.loads(content[20 : 20 + json_length])
     start = 20 + json_length
     binary_length, binary_kind = struct.unpack("<II", content[start : start + 8])
-    assert (binary_kind, json_length % 4, binary_length % 4) == (0x004E4942, 0, 0)
+    assert binary_kind == 0x004E4942
+    assert json_length % 4 == 0
+    assert binary_length % 4 == 0
     binary = content[start + 8 :]
     assert len(binary) == binary_length
     assert tree["asset"]["version"] == "2.0"
     [buffer] = tree["buffers"]
     assert binary_length - 3 <= buffer["byteLength"] <= binary_length
 
-    def view(number: int) -> tuple[int, bytes]:
+    def view(number):
         found = tree["bufferViews"][number]
         first = found.get("byteOffset", 0)
         assert 0 <= first < first + found["byteLength"] <= buffer["byteLength"]
         return first, binary[first : first + found["byteLength"]]
 
-    def array(number: int) -> NDArray[Any]:
+    def array(number):
         accessor = tree["accessors"][number]
         dtype, size = _TYPES[accessor["componentType"]]
         first, content = view(accessor["bufferView"])
@@ -47,7 +52,7 @@ def read_glb(content: bytes) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         values = values.reshape(-1, width)
         for bound, found in (("min", values.min(axis=0)), ("max", values.max(axis=0))):
             if bound in accessor:
-                np.testing.assert_array_equal(np.float32(accessor[bound]), found.astype(np.float32))
+                np.testing.assert_array_equal(np.float32(accessor[bound]), np.float32(found))
         return values
 
     [mesh] = tree["meshes"]
@@ -61,7 +66,7 @@ def read_glb(content: bytes) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     }
     assert arrays["indices"].max() < len(arrays["POSITION"])
     for name in {"NORMAL", "TANGENT"} & set(arrays):
-        np.testing.assert_allclose(np.linalg.norm(arrays[name][:, :3], axis=1), 1, atol=1e-5)
+        assert_unit(arrays[name][:, :3])
     material = tree["materials"][part["material"]]
     extension = material.get("extensions", {}).get("KHR_materials_specular", {})
     assert set(material.get("extensions", {})) == set(tree.get("extensionsUsed", []))

@@ -1,16 +1,12 @@
 """The checks of captures that were made without files."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from splinecli.capture import Capture, CaptureWarning
 from splinecli.capture.arrays import ArraySource
 from splinecli.judge.checks import check_capture
 
 
-def warnings_of(
-    capture: Capture, *, intensities: ArrayLike | None = None
-) -> tuple[CaptureWarning, ...]:
+def warnings_of(capture, *, intensities=None):
     """Return the warnings about a capture, whose light intensities (F,) or (F, 3) were given or are
     unknown.
     """

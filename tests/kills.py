@@ -6,7 +6,6 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -16,7 +15,7 @@ CHANGES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.syml
 """Audit events of Python before a change of files. Opening a file for writing is one, too."""
 
 
-def changes_files(event: str, args: tuple[object, ...]) -> bool:
+def changes_files(event, args):
     if event == "open":
         path, _, flags = args
         return (
@@ -27,11 +26,11 @@ def changes_files(event: str, args: tuple[object, ...]) -> bool:
     return event in CHANGES
 
 
-def killer(step: int) -> Callable[[str, tuple[object, ...]], None]:
+def killer(step):
     """Return an audit hook that kills its process before its change number `step`, from 0."""
     left = step
 
-    def count(event: str, args: tuple[object, ...]) -> None:
+    def count(event, args):
         nonlocal left
         if changes_files(event, args):
             if left == 0:
@@ -41,7 +40,7 @@ def killer(step: int) -> Callable[[str, tuple[object, ...]], None]:
     return count
 
 
-def killed_at(step: int, work: Callable[[], object]) -> bool:
+def killed_at(step, work):
     """Run `work` in a forked process and kill it (SIGKILL) before its change number `step`, from 0.
 
     Returns:
@@ -64,9 +63,7 @@ def killed_at(step: int, work: Callable[[], object]) -> bool:
     os._exit(0)
 
 
-def killed_at_every_step(
-    place: Path, prepare: Callable[[Path], object], work: Callable[[Path], object]
-) -> Iterator[Path]:
+def killed_at_every_step(place, prepare, work):
     """Yield a folder for each change of files of the work: prepared, and killed before it."""
     for step in count():
         folder = place / str(step)
@@ -76,7 +73,7 @@ def killed_at_every_step(
         yield folder
 
 
-def content(folder: Path) -> dict[str, bytes]:
+def content(folder):
     """The content of every file below a folder by its path, hidden ones included."""
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
@@ -85,24 +82,20 @@ def content(folder: Path) -> dict[str, bytes]:
     }
 
 
-# "sync", "rename" or "remove"; the path, and for "rename" the new one
-Call = tuple[str, Path, Path]
-
-
-def record_calls(work: Callable[[], object]) -> list[Call]:
-    """Do the work and return its calls of the system that sync, rename and remove,
-    in their order.
+def record_calls(work):
+    """Do the work and return its calls of the system in their order: "sync", "rename" or "remove",
+    the path, and for "rename" the new one.
     """
-    calls: list[Call] = []
+    calls = []
     fsync = os.fsync
 
-    def sync(handle: int) -> None:
+    def sync(handle):
         fsync(handle)
         path = Path(f"/proc/self/fd/{handle}").readlink()
         calls.append(("sync", path, path))
 
-    def follow(kind: str, change: Callable[..., object]) -> Callable[..., object]:
-        def changed(path: str, *more: str, **options: object) -> object:
+    def follow(kind, change):
+        def changed(path, *more, **options):
             done = change(path, *more, **options)
             calls.append((kind, Path(path).absolute(), Path(more[0] if more else path).absolute()))
             return done
@@ -116,7 +109,7 @@ def record_calls(work: Callable[[], object]) -> list[Call]:
     return calls
 
 
-def missing_syncs(calls: list[Call], report: str | None) -> Iterator[str]:
+def missing_syncs(calls, report):
     """Yield what was changed too early, and the folders whose names may not be on the disk at the
     end.
 
@@ -127,8 +120,7 @@ def missing_syncs(calls: list[Call], report: str | None) -> Iterator[str]:
     """
     if not any(kind == "rename" for kind, _, _ in calls):
         yield "nothing is renamed"
-    synced: set[Path] = set()
-    changed: dict[Path, Path] = {}  # folders with a name that is not synced: that name
+    synced, changed = set(), {}  # folders with a name that is not synced: that name
     for kind, path, place in calls:
         if kind == "sync":
             synced.add(path)

@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pytest import approx
 from safetensors.numpy import load_file
+from scipy.spatial.transform import Rotation
 
-from scenes import read_json
+from scenes import parametrize, read_json
 from splinecli import __version__
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
@@ -38,13 +40,6 @@ def run(capsys):
     return run_benchmark
 
 
-@pytest.fixture
-def coarse_shapes(monkeypatch):
-    """Drawn shapes of few triangles, which small pictures show as well."""
-    monkeypatch.setattr("splinecli.workshop.synthesis.shapes.SPACING", 0.04)
-    monkeypatch.setattr("splinecli.workshop.synthesis.shapes.FEWEST_FACES", 100)
-
-
 def numbers(line):
     return [
         float(number)
@@ -54,24 +49,18 @@ def numbers(line):
 
 SPEEDS = {
     "training_speed --batch-size 4 --steps 1 --warm-up 1 --device cpu": (
-        "compact",
-        "compact, Ls and La",
-        "compact, alternating",
-        "paper",
-        "cnn-ps",
+        "compact|compact, Ls and La|compact, alternating|paper|cnn-ps"
     ),
     "inference_speed --pixels 64 --repeats 1": (
-        "layers of the paper",
-        "spline-net-pixelwise",
-        "spline-net-pixelwise",
+        "layers of the paper|spline-net-pixelwise|spline-net-pixelwise"
     ),
 }
 
 
-@pytest.mark.parametrize("command", SPEEDS)
+@parametrize("command", SPEEDS)
 def test_speeds(run, command):
-    printed = run(command).splitlines()[1:]
-    assert all(line.startswith(name) for line, name in zip(printed, SPEEDS[command], strict=True))
+    printed, names = run(command).splitlines()[1:], SPEEDS[command].split("|")
+    assert all(line.startswith(name) for line, name in zip(printed, names, strict=True))
     assert all(min(numbers(line[25:])) > 0 for line in printed)
 
 
@@ -84,10 +73,8 @@ def test_photographs(run):
 
 @pytest.mark.usefixtures("coarse_shapes")
 def test_faulty_captures(run, tmp_path, monkeypatch):
-    pytest.importorskip("embreex", reason="needs the extra 'render'")
     monkeypatch.setattr("fit_capture_confidence.STEPS", 20)
-    printed = run(f"faulty_captures {tmp_path} --scenes 5 --size 24")
-    assert int(printed.split()[0]) > 5
+    assert int(run(f"faulty_captures {tmp_path} --scenes 5 --size 24").split()[0]) > 5
     rows = run(f"fit_capture_confidence {tmp_path}").splitlines()
     assert rows[0].startswith("| capture | number | claimed before")
     assert "right" in rows[2] + rows[-1] + rows[-2]
@@ -110,7 +97,6 @@ def test_faulty_captures_of_pixel_sets(run, make_set, tmp_path):
 @pytest.mark.usefixtures("coarse_shapes")
 def test_render_accuracy(run):
     pytest.importorskip("mitsuba", reason="compares with Mitsuba 3")
-    pytest.importorskip("embreex", reason="needs the extra 'render'")
     arguments = "--size 12 --samples 4 --scenes 1 --directions 4"
     printed = run(f"render_accuracy {arguments}").splitlines()
     assert [line.split()[0] for line in printed[2:5]] == ["diffuse", "specular", "metallic"]
@@ -119,7 +105,6 @@ def test_render_accuracy(run):
 
 @pytest.mark.usefixtures("coarse_shapes")
 def test_near_lamps(run):
-    pytest.importorskip("embreex", reason="needs the extra 'render'")
     printed = run("near_lamps --size 16 --method ls --widths 4 --off 0.8").splitlines()
     assert len(printed) == 8
     plane = next(row for row in printed if row.split()[:2] == ["matte", "plane"])
@@ -131,7 +116,7 @@ def test_near_lamps(run):
 
 def test_surfaces_of_flat_things(run):
     """Tilts by unknown intensities are levelled; bends by near lamps need the positions."""
-    pytest.importorskip("embreex", reason="needs the extra 'render'")
+    pytest.importorskip("embreex")
     rows = run("surfaces --flat --size 24 --method ls").splitlines()
     assert len(rows) == 9
     for row in rows:
@@ -143,10 +128,7 @@ def test_surfaces_of_flat_things(run):
 
 def test_inspection(run):
     printed = run("inspection --size 96 --plates 1 --depths 0.5 --method ls").splitlines()
-    assert printed[2:] == [
-        "| dent | 0.5 | 4 of 4 | 4 of 4 |",
-        "| scratch | 0.5 | 4 of 4 | 4 of 4 |",
-    ]
+    assert printed[2:] == [f"| {name} | 0.5 | 4 of 4 | 4 of 4 |" for name in ("dent", "scratch")]
 
 
 def test_large_captures(run, tmp_path):
@@ -154,7 +136,7 @@ def test_large_captures(run, tmp_path):
     arguments = f"--megapixels 0.001 --method ls --plot {plot}"
     header, row = run(f"large_captures {arguments}").splitlines()
     assert header.split()[0] == "megapixels"
-    assert numbers(row)[0] == pytest.approx(0.001, abs=2e-4)
+    assert numbers(row)[0] == approx(0.001, abs=2e-4)
     assert row.endswith("exact")
     assert plot.stat().st_size > 1000
 
@@ -169,16 +151,13 @@ def test_gpu_session(tmp_path):
     one, other = str(tmp_path / "one.npy"), str(tmp_path / "other.npy")
     found = session.step("apart", module.normals_apart, one, other, seconds=60)
     turned = math.degrees(math.asin(0.8) - math.asin(0.6))
-    assert (found["mean_deg"], found["max_deg"]) == pytest.approx((turned, turned))
+    assert (found["mean_deg"], found["max_deg"]) == approx((turned, turned))
     assert session.step("missing", module.normals_apart, one, f"{other}.gz", seconds=60) is None
     session.ends = time.time()
     assert session.step("late", module.normals_apart, one, other, seconds=60) is None
     report = (tmp_path / "report.txt").read_text()
-    assert (
-        report.count("FAILED") >= 2
-        and "FileNotFoundError" in report
-        and "there is no time left" in report
-    )
+    assert report.count("FAILED") >= 2 and "FileNotFoundError" in report
+    assert "there is no time left" in report
     steps = [entry["step"] for entry in read_json(tmp_path / "report.json")]
     assert steps == ["apart", "missing", "late"]
 
@@ -193,7 +172,8 @@ def test_all_figures(run, tmp_path):
     command = f"all_figures {tmp_path}/data --results {tmp_path}/results --figures {stored}"
     assert run(f"{command} --trials 2 --only noise/ls").startswith("noise, ls: ")
     measured = read_json(stored)["noise"]
-    assert (measured["version"], len(measured["weights"])) == (__version__, 8)
+    assert measured["version"] == __version__
+    assert len(measured["weights"]) == 8
     assert list(measured["rows"]) == ["ls"]
     assert list(measured["rows"]["ls"]) == ["0", "2", "4", "8"]
     assert measured["rows"]["ls"]["0"] < measured["rows"]["ls"]["8"]
@@ -225,23 +205,17 @@ def test_measured_spheres(run, shared_data, tmp_path):
     assert trained < 0.7 * fit
 
 
-def test_measured_materials_are_those_of_explicit_vectors(tmp_path):
-    random = np.random.default_rng(0)
-    shapes = {
-        "W1": (3, 6, 5),
-        "b1": (3, 5),
-        "W2": (3, 5, 4),
-        "b2": (3, 4),
-        "W3": (3, 4, 3),
-        "b3": (3, 3),
-    }
-    arrays = {key: random.normal(0.2, 0.3, shape) for key, shape in shapes.items()}
+def test_measured_materials_are_those_of_explicit_vectors(tmp_path, rng):
+    arrays = {}
+    for layer, shape in enumerate(((6, 5), (5, 4), (4, 3)), start=1):
+        arrays[f"W{layer}"] = rng.normal(0.2, 0.3, (3, *shape))
+        arrays[f"b{layer}"] = rng.normal(0.2, 0.3, (3, shape[1]))
     np.savez(tmp_path / "materials.npz", names=["first", "brass", "third"], **arrays)
     materials = importlib.import_module("measured_spheres").read_materials(
         tmp_path / "materials.npz"
     )
     assert materials.names == ["first", "third"]  # not the implausible one
-    normals, lights = (random.normal((0, 0, 2), 1, (count, 3)) for count in (6, 20))
+    normals, lights = (rng.normal((0, 0, 2), 1, (count, 3)) for count in (6, 20))
     normals, lights = (unit(v) for v in (normals, lights))
     n, light = (torch.from_numpy(v).float() for v in (normals, lights))
     shaded = materials.shade(torch.tensor([0, 1] * 3), n @ light.T, n[:, 2:], light[:, 2])
@@ -249,7 +223,7 @@ def test_measured_materials_are_those_of_explicit_vectors(tmp_path):
         expected = _brdf(arrays, 2 * (pixel % 2), normals[pixel], lights[column])
         expected *= math.pi * max(float(normals[pixel] @ lights[column]), 0)
         # In float32, the angles are known to some 1e-4 where half vector and normal all but meet.
-        assert shaded[pixel, column].item() == pytest.approx(expected, rel=1e-3, abs=1e-5)
+        assert shaded[pixel, column].item() == approx(expected, rel=1e-3, abs=1e-5)
 
 
 def _brdf(arrays, material, n, light):
@@ -265,19 +239,16 @@ def _brdf(arrays, material, n, light):
     # the normal along z, the half vector at azimuth zero
     frame = np.stack((tangent, np.cross(n, tangent), n))
     half, light = frame @ half, frame @ light
-    cosine, sine = half[2], math.sqrt(1 - half[2] ** 2)
-    difference = np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]]) @ light
+    difference = Rotation.from_euler("y", -math.acos(half[2])).apply(light)
     value = np.concatenate((half, (difference[0], abs(difference[1]), difference[2])))
     for layer in (1, 2):
         value = np.maximum(value @ arrays[f"W{layer}"][material] + arrays[f"b{layer}"][material], 0)
-    return float(
-        np.maximum(np.exp(value @ arrays["W3"][material] + arrays["b3"][material]) - 1, 0).mean()
-    )
+    value = np.exp(value @ arrays["W3"][material] + arrays["b3"][material]) - 1
+    return np.maximum(value, 0).mean()
 
 
 @pytest.mark.usefixtures("coarse_shapes")
 def test_materials(run):
-    pytest.importorskip("embreex", reason="needs the extra 'render'")
     printed = run("materials --scenes 1 --size 16 --sets metallic").splitlines()
     assert "material" in printed[0]
     assert [line.split("|")[1].strip() for line in printed[3:5]] == ["all", "highlight observable"]
@@ -286,7 +257,6 @@ def test_materials(run):
 @pytest.mark.usefixtures("coarse_shapes")
 def test_judgement(run, tmp_path):
     """Captures are the same at each run, and each is measured once."""
-    pytest.importorskip("embreex", reason="needs the extra 'render'")
     made, found = tmp_path / "made", tmp_path / "found"
     counts = "--right 2 --faulty 4"
     run(f"judgement render {made} {counts} --part 1/2")
@@ -307,7 +277,7 @@ def test_judgement(run, tmp_path):
     assert run(f"judgement report {found} {found}") == printed
 
 
-def test_train_judge_net(run, tmp_path, coarse_shapes, monkeypatch):
+def test_train_judge_net(run, tmp_path, coarse_shapes, monkeypatch, rng):
     """A network learns classes that one feature tells apart, and its probabilities follow."""
     drawn = tmp_path / "drawn.npz"
     run(f"train_judge_net draw {drawn} --scenes 1")
@@ -315,7 +285,6 @@ def test_train_judge_net(run, tmp_path, coarse_shapes, monkeypatch):
         n_features = stored["features"].shape[1]
         assert np.abs(stored["features"]).max() <= 15
         assert set(stored["classes"]) <= set(range(len(CLASSES)))
-    rng = np.random.default_rng(0)
     classes = rng.integers(0, len(CLASSES), 600)
     features = rng.normal(0, 0.1, (600, n_features))
     features[np.arange(600), classes] += 1

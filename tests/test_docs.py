@@ -7,13 +7,12 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
 
-import pytest
 import typer
 
 import figure_plots
 import figure_tables
 import splinecli
-from scenes import read_json
+from scenes import names_in, parametrize, read_json
 from splinecli.cli.main import app
 from splinecli.errors import InputError, ModelError, OutputError, UsageError
 
@@ -37,7 +36,7 @@ def anchors(page):
     return {re.sub(r"[^\w\- ]", "", heading).lower().replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=by_name)
+@parametrize("page", PAGES, ids=by_name)
 def test_links_resolve(page):
     """Each relative link leads to a file, and its anchor to a heading."""
     text = page.read_text("utf-8")
@@ -89,7 +88,7 @@ def commands():
                     yield by_name(page), words.removeprefix(".venv/bin/")
 
 
-@pytest.mark.parametrize("page, command", sorted(set(commands())))
+@parametrize("page, command", sorted(set(commands())))
 def test_commands_have_options_that_exist(page, command):
     group: Any = typer.main.get_command(app)
     _, *words = shlex.split(command, comments=True)
@@ -188,7 +187,7 @@ def test_places_of_the_contributing_page():
     assert [path for path in paths if not any((r / path).exists() for r in roots)] == []
 
 
-@pytest.mark.parametrize("name", figure_tables.PAGES)
+@parametrize("name", figure_tables.PAGES)
 def test_tables_of_figures(name):
     """Each table says what docs/figures.json says. `python benchmarks/figure_tables.py` writes
     them.
@@ -217,9 +216,7 @@ def test_plots_of_figures(tmp_path):
     ):
         drawn = (tmp_path / name).read_text("utf-8")
         assert all(f">{method}</text>" in drawn for method in methods)
-    assert {path.name for path in tmp_path.iterdir()} == {
-        path.name for path in DOCS.glob("pictures/accuracy_*.svg")
-    }
+    assert names_in(tmp_path) == {path.name for path in DOCS.glob("pictures/accuracy_*.svg")}
 
 
 def test_figures_of_other_weights_are_marked():

@@ -5,12 +5,10 @@ the distance.
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
 
 import splinecli
-from scenes import spiral_lights
-from splinecli.capture import Capture
+from scenes import as_capture, parametrize, pinhole, refuses, spiral_lights, square_grid, tilted
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.errors import InputError, UsageError
 from splinecli.estimate import inference
@@ -21,27 +19,27 @@ from splinecli.maths.pixel_grid import Blocks, pixel_rays
 
 SIDE = 40
 LIGHTS = spiral_lights(10, 50, 20)
-MATRIX = np.array([(60.0, 0, 20.5), (0, 60.0, 18.0), (0, 0, 1)])
+MATRIX = pinhole(60, 20.5, 18)
 
 
 def surface(kind, side=SIDE):
     """Return points (P, 3) with a mean height of 0 in a frame that is 2 wide, normals (P, 3) and
     the mask.
     """
-    place = (np.arange(side) + 0.5) * 2 / side - 1
-    x, y = np.meshgrid(place, -place)
-    mask = np.ones(x.shape, np.bool_)
-    if kind == "plane":
-        z, normals = 0 * x, np.dstack((0 * x, 0 * x, 0 * x + 1))
-    elif kind == "tilted":
-        z, normals = 0.3 * x - 0.1 * y, np.dstack((0 * x - 0.3, 0 * x + 0.1, 0 * x + 1))
-    else:
-        mask = np.hypot(x, y) < 0.95
-        z = np.sqrt(np.maximum(1.1 - x**2 - y**2, 0))
-        normals = np.dstack((x, y, z))
+    x, y = square_grid(side, 1 - 1 / side)
+    mask = np.hypot(x, y) < {"dome": 0.95}.get(kind, 2)
+    z = {
+        "plane": 0 * x,
+        "tilted": 0.3 * x - 0.1 * y,
+        "dome": np.sqrt(np.maximum(1.1 - x**2 - y**2, 0)),
+    }[kind]
+    normals = unit(np.dstack((x, y, z)))
+    if kind != "dome":
+        down, right = np.gradient(z, 2 / side)
+        normals = tilted(-right, down)
     points = np.dstack((x, y, z))[mask]
     points[:, 2] -= points[:, 2].mean()
-    return points, unit(normals)[mask], mask
+    return points, normals[mask], mask
 
 
 def capture_of(shape, positions, strengths=1.0):
@@ -51,10 +49,8 @@ def capture_of(shape, positions, strengths=1.0):
     shading = np.clip(np.einsum("pfc,pc->pf", towards / distance[..., None], normals), 0, None)
     truth = np.zeros((*mask.shape, 3), np.float32)
     truth[mask] = normals
-    observations = (0.6 * shading * strengths / distance**2).astype(np.float32)
-    return Capture(
-        "scene", observations, unit(positions), tuple(range(len(positions))), mask, truth
-    )
+    observations = 0.6 * shading * strengths / distance**2
+    return as_capture(observations, unit(positions), mask, ground_truth=truth)
 
 
 def near(kind, distance, side=SIDE):
@@ -67,7 +63,7 @@ def error_deg(capture):
     return estimate_normals(capture, make_estimator("iw12")).errors.mean
 
 
-@pytest.mark.parametrize("kind, limit_deg", [("plane", 0.001), ("tilted", 0.02), ("dome", 0.2)])
+@parametrize("kind, limit_deg", [("plane", 0.001), ("tilted", 0.02), ("dome", 0.2)])
 def test_lamps_at_two_widths(kind, limit_deg):
     """Exact data give exact normals, apart from the integration, whose error is that of a grid of
     40 x 40 pixels.
@@ -96,19 +92,19 @@ def test_intensities_hold_at_the_origin():
     capture = capture_of(surface("dome"), positions)
     equal = NearLamps.of(positions, 2 / SIDE, (SIDE, SIDE), equal=True)
     assert error_deg(replace(capture, lamps=equal)) < 0.2
-    at_origin = capture.observations * (distances**2).astype(np.float32)
+    at_origin = capture.observations * np.float32(distances**2)
     measured = NearLamps.of(positions, 2 / SIDE, (SIDE, SIDE), equal=False)
     assert error_deg(replace(capture, observations=at_origin, lamps=measured)) < 0.2
 
 
-@pytest.mark.parametrize("equal", [True, False])
-def test_lamps_that_shine_in_lobes(equal):
+@parametrize("equal", [True, False])
+def test_lamps_that_shine_in_lobes(equal, rng):
     """LEDs that miss the middle of the object by up to 30 degrees, of equal power or measured at
     the origin.
     """
     points, normals, mask = surface("dome")
     positions = LIGHTS * np.linspace(3, 6, 10)[:, None]
-    axes = unit(0.4 * np.random.default_rng(0).normal(size=(10, 3)) - LIGHTS)
+    axes = unit(0.4 * rng.normal(size=(10, 3)) - LIGHTS)
     exponents = np.linspace(0, 6, 10)
 
     def strengths(places):
@@ -135,8 +131,7 @@ def test_a_perspective_camera():
     points = rays * (depth * normal[2] / -(rays @ normal))[:, None]
     middle = np.array(((19.5 - 20.5) / 60, -(19.5 - 18.0) / 60, -1)) * depth
     positions = LIGHTS * 4.0
-    normals = np.tile(normal, (len(points), 1))
-    capture = capture_of((points - middle, normals, mask), positions)
+    capture = capture_of((points - middle, np.tile(normal, (len(points), 1)), mask), positions)
     lamps = NearLamps.of(positions, pixel_size, mask.shape, equal=True, camera_matrix=MATRIX)
     # Depth is known up to its geometric mean, which is not exactly the depth of the middle.
     assert error_deg(replace(capture, lamps=lamps)) < 0.3
@@ -148,7 +143,7 @@ def glossy_sphere(half_angle_deg, *, gloss=1.0, side=32):
     Blinn-Phong's.
     """
     focal, middle = side / 2 / np.tan(np.radians(half_angle_deg)), (side - 1) / 2
-    matrix = np.array([(focal, 0, middle), (0, focal, middle), (0, 0, 1)])
+    matrix = pinhole(focal, middle, middle)
     rays = unit(pixel_rays(np.ones((side, side), np.bool_), matrix))
     distance = 1 / np.sin(np.radians(half_angle_deg))
     along = -rays[:, 2] * distance  # of a ray, to the point next to the centre
@@ -161,8 +156,8 @@ def glossy_sphere(half_angle_deg, *, gloss=1.0, side=32):
     highlight = np.clip(np.einsum("pfc,pc->pf", half, normals), 0, None) ** 30 * (cosine > 0)
     mask, truth = hit.reshape(side, side), np.zeros((side, side, 3), np.float32)
     truth[mask] = normals
-    seen = (0.5 * (cosine + gloss * highlight)).astype(np.float32)
-    return Capture("sphere", seen, LIGHTS, tuple(range(10)), mask, truth, camera_matrix=matrix)
+    seen = 0.5 * (cosine + gloss * highlight)
+    return as_capture(seen, LIGHTS, mask, ground_truth=truth, camera_matrix=matrix)
 
 
 def test_the_shipped_network_sees_gloss_from_a_near_camera():
@@ -176,25 +171,22 @@ def test_the_shipped_network_sees_gloss_from_a_near_camera():
     assert found.errors.mean < 0.6 * without.errors.mean
 
 
-def test_least_squares_does_not_depend_on_the_camera():
-    capture, estimator = glossy_sphere(20), make_estimator("ls")
+@parametrize(
+    "half_angle_deg, method, atol", [(20, "ls", 1e-4), (0.001, "spline-net-pixelwise", 2e-3)]
+)
+def test_where_the_camera_makes_no_difference(half_angle_deg, method, atol):
+    """For least squares; and far away, at a focal length where rays differ by 0.002 degrees."""
+    capture = glossy_sphere(half_angle_deg, side=20)
     maps = [
-        estimate_normals(each, estimator).normal_map
+        estimate_normals(each, make_estimator(method)).normal_map
         for each in (capture, replace(capture, camera_matrix=None))
     ]
-    assert_allclose(*maps, atol=1e-4)
+    assert_allclose(*maps, atol=atol)
+
+
+def test_a_matte_sphere_before_a_near_camera():
     matte = estimate_normals(glossy_sphere(20, gloss=0), make_estimator("iw12"))
     assert matte.errors.median < 0.1  # shadows at the rim
-
-
-def test_a_camera_far_away_is_orthographic():
-    """At this focal length, rays differ by 0.002 degrees."""
-    capture, estimator = glossy_sphere(0.001, side=20), make_estimator("spline-net-pixelwise")
-    maps = [
-        estimate_normals(each, estimator).normal_map
-        for each in (capture, replace(capture, camera_matrix=None))
-    ]
-    assert_allclose(*maps, atol=2e-3)
 
 
 def images_of(capture):
@@ -211,12 +203,10 @@ def test_the_python_door_takes_a_camera():
     )
     expected = estimate_normals(capture, make_estimator("st14")).normal_map
     assert_allclose(found.normal_map, expected, atol=1e-5)
-    assert (
-        np.abs(splinecli.estimate_normals(*arguments, method="st14").normal_map - expected).max()
-        > 0.01
-    )
+    without = splinecli.estimate_normals(*arguments, method="st14").normal_map
+    assert np.abs(without - expected).max() > 0.01
     for matrix, error in ((np.eye(2), UsageError), (-np.eye(3), InputError)):
-        with pytest.raises(error, match="camera matrix"):
+        with refuses("camera matrix", error):
             splinecli.estimate_normals(*arguments, camera_matrix=matrix, method="ls")
 
 
@@ -225,8 +215,7 @@ def test_large_captures_are_found_at_a_reduced_size(monkeypatch):
     whole = find_surface(capture).lamps
     monkeypatch.setattr(inference, "PIXELS_ON_THE_WAY", 900)
     assert Blocks.over(capture.mask, 900).step == 3
-    reduced = find_surface(capture).lamps
-    assert np.abs(reduced.points - whole.points).mean() < 0.01
+    assert np.abs(find_surface(capture).lamps.points - whole.points).mean() < 0.01
     assert error_deg(capture) < 0.2
 
 

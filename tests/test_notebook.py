@@ -4,8 +4,6 @@ import base64
 import contextlib
 import io
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -14,7 +12,18 @@ import numpy as np
 import pytest
 
 import splinecli
-from scenes import FOUR_LIGHTS, codes, read_image, read_json, write_image
+from scenes import (
+    FOUR_LIGHTS,
+    codes,
+    parametrize,
+    put,
+    read_image,
+    read_json,
+    refuses,
+    run_python,
+    tilted,
+    write_image,
+)
 from splinecli.capture.arrays import open_arrays
 from splinecli.cli.main import main
 from splinecli.errors import InputError, UsageError
@@ -42,8 +51,7 @@ def read_medallion(folder=MEDALLION):
 def matte(dtype=np.float64, scale=1.0):
     """Images (F, H, W) of a matte bowl, and its normals (H, W, 3)."""
     y, x = np.mgrid[0.2:-0.2:13j, -0.2:0.2:11j]
-    normals = np.stack((x, y, np.ones_like(x)), axis=-1)
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    normals = tilted(x, y)
     return (scale * np.moveaxis(normals @ FOUR_LIGHTS.T, -1, 0)).astype(dtype), normals
 
 
@@ -81,7 +89,7 @@ def test_quickstart(request, monkeypatch):
         cell["execution_count"] = number
     if request.config.getoption("--update-golden"):
         text = json.dumps(notebook, indent=1, ensure_ascii=False)
-        Path("quickstart.ipynb").write_text(text + "\n", "utf-8")
+        put("quickstart.ipynb", text + "\n")
         return
     for before, cell in zip(stored, cells, strict=True):
         found, expected = (
@@ -115,7 +123,7 @@ def test_the_same_warnings_as_infer(tmp_path):
     assert "untrained_lights" in codes(told)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "dtype, scale", [(np.float32, 3.0), (np.float64, 1e-3), (np.uint16, 50_000), (np.uint8, 200)]
 )
 def test_matte_images_of_each_type(dtype, scale):
@@ -135,7 +143,7 @@ def test_saturated_values_are_restored_unless_as_stored():
     lights = np.concatenate((FOUR_LIGHTS, FOUR_LIGHTS[1:] * (-1, -1, 1)))
     _, normals = matte()
     images = np.moveaxis(normals @ lights.T, -1, 0)
-    clipped = np.minimum(65_535 * images / 0.85, 65_535).astype(np.uint16)
+    clipped = np.uint16(np.minimum(65_535 * images / 0.85, 65_535))
     assert 0.1 < (clipped == 65_535).mean() < 0.5
 
     def worst(images, **options):
@@ -154,7 +162,7 @@ def test_saturated_values_are_restored_unless_as_stored():
     assert worst(shares, white_level=1.0) == pytest.approx(restored, abs=1e-4)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "change, error, message",
     [
         ({"images": np.ones((4, 5))}, UsageError, "found images of shape"),
@@ -193,8 +201,7 @@ def test_wrong_arguments(change, error, message):
 
 def test_importing_the_package_loads_neither_torch_nor_numpy():
     code = "import sys, splinecli; print({'numpy', 'torch', 'cv2'}.intersection(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert done.stdout == "set()\n"
+    assert run_python(code, check=True).stdout == "set()\n"
 
 
 def test_the_capture_has_a_mask_of_its_own():
@@ -205,13 +212,12 @@ def test_the_capture_has_a_mask_of_its_own():
     assert estimate.capture.mask.all()
 
 
-@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float64])
-def test_a_mask_of_numbers_obeys_the_rule_of_mask_files(kind):
+@parametrize("kind", [np.uint8, np.uint16, np.float64])
+def test_a_mask_of_numbers_obeys_the_rule_of_mask_files(kind, rng):
     """A gray edge at or below half of the largest value is outside; any value of a bool mask that
     is True counts.
     """
-    generator = np.random.default_rng(0)
-    images = generator.uniform(0.1, 1, (4, 2, 3))
+    images = rng.uniform(0.1, 1, (4, 2, 3))
     directions = [(0.1, 0, 1), (0, 0.4, 1), (-0.5, 0, 1), (0, -0.6, 1)]
     numbers = np.array([[0, 100, 101], [200, 50, 200]], kind)
     capture = prepare_capture(
@@ -222,7 +228,7 @@ def test_a_mask_of_numbers_obeys_the_rule_of_mask_files(kind):
         open_arrays(images, directions, numbers > 0), options=RecipeOptions(as_stored=True)
     )
     assert capture.n_pixels == 5
-    with pytest.raises(InputError, match="mask"):
+    with refuses("mask"):
         prepare_capture(
             open_arrays(images, directions, np.zeros((2, 3), kind)),
             options=RecipeOptions(as_stored=True),

@@ -6,18 +6,16 @@ import re
 from pathlib import Path
 
 import numpy as np
-import pytest
 import typer
 
 import make_tables
 import splinecli
 from html_page import REPORT
 from judged import warnings_of
-from scenes import FOUR_LIGHTS, codes
+from scenes import FOUR_LIGHTS, codes, parametrize, refuses
 from splinecli.capture import Capture
 from splinecli.capture.files import NOT_PHOTOGRAPHS
 from splinecli.cli.main import app
-from splinecli.errors import InputError
 from splinecli.estimate.inference import estimate_normals
 from splinecli.estimate.methods import METHODS, Estimator, Method, make_estimator, method_names
 from splinecli.judge import checks
@@ -38,7 +36,7 @@ def capture():
     return Capture("flat", observations, FOUR_LIGHTS, tuple(range(4)), np.ones((2, 3), np.bool_))
 
 
-@pytest.mark.parametrize("name", make_tables.PAGES)
+@parametrize("name", make_tables.PAGES)
 def test_tables_of_the_documentation(name):
     """`python docs/generate.py` writes them."""
     text = (make_tables.DOCS / name).read_text("utf-8")
@@ -99,7 +97,7 @@ def test_a_warning_is_a_row(monkeypatch):
     monkeypatch.setattr(checks, "CHECKS", [*checks.CHECKS, checks.Check(check)])
     warnings = warnings_of(capture())
     assert "uniform" in codes(warnings)
-    with pytest.raises(InputError, match="All values are equal"):
+    with refuses("All values are equal"):
         checks.refuse_if_strict(warnings[-1:], "flat", strict=True)
 
 
@@ -148,7 +146,7 @@ def slant(source, estimate, progress):
     return estimate.normal_map[..., 2]
 
 
-@pytest.mark.parametrize("row", MAPS.values(), ids=list(MAPS))
+@parametrize("row", MAPS.values(), ids=list(MAPS))
 def test_functions_of_the_maps_exist(row):
     assert {row.name, *(part.name for part in row.parts)} <= MAP_FUNCTIONS.keys()
     assert {Path(name).stem for name in row.files.values()} <= NOT_PHOTOGRAPHS or row.suffixes == (

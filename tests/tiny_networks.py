@@ -10,7 +10,7 @@ from splinecli.estimate.networks.spline_net import SplineNet
 TINY: dict[str, Any] = {"width": 8, "li_blocks": 1, "ne_blocks": 1, "head_width": 16}
 
 
-def random_network(**settings: Any) -> SplineNet:
+def random_network(**settings):
     """Make a network all of whose layers are random: the last ones start at zero, where every
     symmetry holds.
     """

@@ -6,23 +6,22 @@ import os
 import signal
 import time
 from pathlib import Path
-from typing import Any
 
 
-def double(folder: str, number: int) -> int:
+def double(folder, number):
     return 2 * number
 
 
-def threads(folder: str, number: int) -> str:
+def threads(folder, number):
     return os.environ["OMP_NUM_THREADS"]
 
 
-def survive_an_interrupt(folder: str, number: int) -> int:
+def survive_an_interrupt(folder, number):
     os.kill(os.getpid(), signal.SIGINT)
     return os.getpid()
 
 
-def die_of_thirteen(folder: str, number: int) -> int:
+def die_of_thirteen(folder, number):
     """Return the double; a task of number 13 kills its worker."""
     with (Path(folder) / f"begun-{number}").open("a") as file:
         file.write("x")
@@ -31,7 +30,7 @@ def die_of_thirteen(folder: str, number: int) -> int:
     return 2 * number
 
 
-def count_neighbours(folder: str, number: int) -> int:
+def count_neighbours(folder, number):
     """Return how many tasks run now, this one among them."""
     mark = Path(folder) / f"running-{number}"
     mark.touch()
@@ -41,5 +40,5 @@ def count_neighbours(folder: str, number: int) -> int:
     return running
 
 
-async def set_resources(dask_worker: Any, **resources: float) -> None:
+async def set_resources(dask_worker, **resources):
     await dask_worker.set_resources(**resources)

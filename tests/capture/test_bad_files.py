@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 import tifffile
 
-from scenes import to_uint16, write_image
+from scenes import parametrize, refuses, to_uint16, vectors, write_image
 from splinecli.capture import open_capture
 from splinecli.errors import InputError
 from splinecli.recipe import prepare_capture, read_capture
 
-LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.6, 0, 0.8]])
+LIGHTS = vectors("0 0 1; 0.6 0 0.8; 0 0.6 0.8; -0.6 0 0.8")
 
 
 @pytest.fixture
 def folder(tmp_path):
     for number in range(4):
-        pixels = np.random.default_rng(number).integers(0, 60_000, (20, 25, 3)).astype(np.uint16)
+        pixels = np.uint16(np.random.default_rng(number).integers(0, 60_000, (20, 25, 3)))
         tifffile.imwrite(tmp_path / f"{number}.tif", pixels, photometric="rgb")
     np.savetxt(tmp_path / "lights.txt", LIGHTS)
     return tmp_path
@@ -36,22 +36,21 @@ def no_warnings(capfd):
 
 
 @pytest.mark.usefixtures("no_warnings")
-@pytest.mark.parametrize("light", [(0, 0, 1), (0.6, 0, 0.8)])
-@pytest.mark.parametrize("as_stored", [True, False])
-def test_identical_lights(tmp_path, light, as_stored):
+@parametrize("light", [(0, 0, 1), (0.6, 0, 0.8)])
+@parametrize("as_stored", [True, False])
+def test_identical_lights(tmp_path, light, as_stored, rng):
     """On a scene whose intensities would be estimated, were the lights not identical."""
-    rng = np.random.default_rng(0)
     for number in range(8):
         shading = np.linspace(0.1, 1, 900).reshape(30, 30) * rng.uniform(0.5, 1.5)
         write_image(tmp_path / f"{number}.png", to_uint16(shading * 40_000))
     np.savetxt(tmp_path / "lights.txt", [light] * 8)
-    with pytest.raises(InputError, match="the 8 lights are in one plane"):
+    with refuses("the 8 lights are in one plane"):
         read_capture(tmp_path, as_stored=as_stored)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "name",
-    ["1.tif", "lights.txt", "light_intensities.txt", "mask.png", "normals_gt.npy", "ambient.png"],
+    "1.tif lights.txt light_intensities.txt mask.png normals_gt.npy ambient.png",
 )
 def test_a_file_that_may_not_be_read(folder, monkeypatch, name):
     """Even root may not."""
@@ -75,5 +74,5 @@ def test_a_file_that_may_not_be_read(folder, monkeypatch, name):
 def test_an_image_that_vanishes(folder):
     source = open_capture(folder)
     (folder / "3.tif").unlink()
-    with pytest.raises(InputError, match=r"3\.tif: the file (does not exist|cannot be read)"):
+    with refuses(r"3\.tif: the file (does not exist|cannot be read)"):
         prepare_capture(source)

@@ -4,9 +4,22 @@ import cv2
 import numpy as np
 import pytest
 
-from scenes import codes, read_json, ring_lights, shade, sphere, to_uint16, write_capture
+from scenes import (
+    codes,
+    parametrize,
+    put,
+    read_json,
+    refuses,
+    ring_lights,
+    shade,
+    sphere,
+    to_uint16,
+    vectors,
+    write_capture,
+    write_image,
+)
 from splinecli.capture.channel_lights import channel_lights
-from splinecli.errors import InputError, UsageError
+from splinecli.errors import UsageError
 from splinecli.lights.calibration.balls import find_ball_files
 from splinecli.lights.calibration.crosstalk import measure_crosstalk
 from splinecli.maths.normals import angle_between_deg
@@ -16,7 +29,7 @@ from splinecli.pipeline.info import describe_capture, summary_lines
 
 NORMALS, MASK = sphere(90)
 LIGHTS = np.concatenate((ring_lights(3, 35), ring_lights(3, 50, 0.8)))
-CROSSTALK = np.array([[1.0, 0.2, 0.05], [0.15, 1.3, 0.2], [0.02, 0.25, 0.7]])
+CROSSTALK = vectors("1 0.2 0.05; 0.15 1.3 0.2; 0.02 0.25 0.7")
 
 
 def photograph(lights, crosstalk=CROSSTALK, paint=1.0):
@@ -35,7 +48,7 @@ def write(folder, count, paint=1.0):
         photograph(lights, paint=paint),
         lights,
         mask=MASK,
-        normals=NORMALS.astype(np.float32),
+        normals=np.float32(NORMALS),
     )
     np.savetxt(folder / "crosstalk.txt", CROSSTALK)
     return folder
@@ -53,7 +66,7 @@ def errors_deg(folder, out, lights, **options):
     return angle_between_deg(normals_of(folder, out, **options)[lit], NORMALS[lit])
 
 
-@pytest.mark.parametrize("count", [1, 2])
+@parametrize("count", [1, 2])
 def test_a_colour_image_gives_the_normals_of_a_gray_sphere(count, tmp_path):
     folder = write(tmp_path / "gray", count)
     assert errors_deg(folder, tmp_path / "out", LIGHTS[: 3 * count]).max() < 0.2
@@ -67,12 +80,9 @@ def test_messages_count_the_lights_of_channels(tmp_path):
     report = describe_capture(InfoOptions(capture=folder), reading)
     assert report["images"] == 1 and "few_lights" not in report["warning_codes"]
     assert "images       1 (000.png): 90 x 90, RGB" in summary_lines(report)[1]
-    source = reading.open(folder)
-    assert source.image_names((0, 2)) == ["000.png (R)", "000.png (B)"]
+    assert reading.open(folder).image_names((0, 2)) == ["000.png (R)", "000.png (B)"]
     np.savetxt(folder / "light_directions.txt", LIGHTS[:1])
-    with pytest.raises(
-        InputError, match=r"found 1 light direction, expected 3, three for each image.* R, G, B"
-    ):
+    with refuses(r"found 1 light direction, expected 3, three for each image.* R, G, B"):
         reading.open(folder)
 
 
@@ -102,7 +112,7 @@ def test_each_image_has_its_flat_field(tmp_path):
     write_capture(flats, to_uint16(falloff * 50_000), None)
     assert errors_deg(folder, tmp_path / "out", LIGHTS, flat_field=str(flats)).max() < 0.2
     write_capture(flats, to_uint16(falloff[:1] * 50_000), None, first=2)
-    with pytest.raises(InputError, match="found 3 flat-field images, expected 1 or 2, one for"):
+    with refuses("found 3 flat-field images, expected 1 or 2, one for"):
         normals_of(folder, tmp_path / "other", flat_field=str(flats))
 
 
@@ -111,24 +121,24 @@ def test_crosstalk_is_measured_on_a_gray_ball(tmp_path):
     found = measure_crosstalk(find_ball_files(tmp_path / "ball"), LIGHTS)
     expected = CROSSTALK / np.trace(CROSSTALK) * 3
     assert found == pytest.approx(np.stack((expected, expected)), abs=0.02)
-    with pytest.raises(InputError, match="2 colour images of the gray ball and 3 lights"):
+    with refuses("2 colour images of the gray ball and 3 lights"):
         measure_crosstalk(find_ball_files(tmp_path / "ball"), LIGHTS[:3])
 
 
 def test_what_does_not_fit_is_refused(tmp_path):
     write(tmp_path / "gray", 1)
-    (tmp_path / "matrix.txt").write_text("1 1 1\n1 1 1\n1 1 1.1\n")
-    with pytest.raises(InputError, match="do not separate the lamps"):
+    put(tmp_path / "matrix.txt", "1 1 1\n1 1 1\n1 1 1.1\n")
+    with refuses("do not separate the lamps"):
         channel_lights(tmp_path / "matrix.txt", 1)
-    (tmp_path / "matrix.txt").write_text("1 0 0\n0 1 0\n0 -0.2 1\n")
-    with pytest.raises(InputError, match=r"found the negative response -0\.2"):
+    put(tmp_path / "matrix.txt", "1 0 0\n0 1 0\n0 -0.2 1\n")
+    with refuses(r"found the negative response -0\.2"):
         channel_lights(tmp_path / "matrix.txt", 1)
-    (tmp_path / "matrix.txt").write_text("1 0\n0 1\n")
-    with pytest.raises(InputError, match="found 2 x 2 numbers, expected 3 x 3"):
+    put(tmp_path / "matrix.txt", "1 0\n0 1\n")
+    with refuses("found 2 x 2 numbers, expected 3 x 3"):
         normals_of(tmp_path / "gray", tmp_path / "out", crosstalk=str(tmp_path / "matrix.txt"))
     name = str(tmp_path / "gray/000.png")
-    assert cv2.imwrite(name, cv2.imread(name, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH))
-    with pytest.raises(InputError, match="the image is gray"):
+    write_image(name, cv2.imread(name, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH))
+    with refuses("the image is gray"):
         normals_of(tmp_path / "gray", tmp_path / "out")
     for options in ({"crosstalk": "matrix.txt"}, {"lights_in_channels": True, "align": True}):
         with pytest.raises(UsageError):

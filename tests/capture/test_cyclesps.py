@@ -7,15 +7,13 @@ import pytest
 import tifffile
 from numpy.testing import assert_allclose, assert_array_equal
 
-from scenes import to_uint16, write_image
+from scenes import on_sphere, to_uint16, vectors, write_image
 from splinecli.capture import capture_name, find_captures, open_capture
 from splinecli.errors import InputError
 from splinecli.recipe import read_capture
 
 HEIGHT, WIDTH = 7, 11  # unequal, so that nothing is turned round unnoticed
-LIGHTS = np.array(
-    [(0.1, 0.2, 0.9), (-0.7, 0.1, 0.5), (0.3, -0.6, 0.4), (0.0, 0.5, 0.6), (0.5, 0.5, 0.3)]
-)
+LIGHTS = vectors("0.1 0.2 0.9; -0.7 0.1 0.5; 0.3 -0.6 0.4; 0 0.5 0.6; 0.5 0.5 0.3")
 
 
 def normals():
@@ -23,7 +21,7 @@ def normals():
     other.
     """
     y, x = np.mgrid[0.5:-0.4:7j, -0.6:0.7:11j]
-    return np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
+    return on_sphere(x, y)
 
 
 def boundaries():
@@ -78,7 +76,7 @@ def test_every_value_is_what_was_written(tmp_path):
     mask = (inner > 0) | (rim > 0)
     assert capture.n_pixels == 35
     assert_array_equal(capture.mask, mask)
-    expected = written.astype(np.float64).mean(axis=-1)[:, mask].T / 65535
+    expected = np.float64(written).mean(axis=-1)[:, mask].T / 65535
     # float32 keeps 24 bits, and three channels are added.
     assert_allclose(capture.observations, expected, rtol=3e-7, atol=0)
     unit = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True)

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.io import savemat
 
-from scenes import put, write_image
+from scenes import parametrize, put, refuses, vectors, write_image
 from splinecli.capture import read_light_directions, read_light_intensities
 from splinecli.capture.light_files import light_encoder, match_images, read_lights
 from splinecli.errors import InputError
 from splinecli.maths.normals import unit
 
-DIRECTIONS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, -0.6, 0.8], [-0.48, 0.36, 0.8]])
+DIRECTIONS = vectors("0 0 1; 0.6 0 0.8; 0 -0.6 0.8; -0.48 0.36 0.8")
 ROWS = ["0 0 1", "0.6 0 0.8", "0 -0.6 0.8", "-0.48 0.36 0.8"]
 
 
@@ -47,7 +47,7 @@ FORMS = {
 }
 
 
-@pytest.mark.parametrize("form", FORMS)
+@parametrize("form", FORMS)
 def test_directions(tmp_path, form):
     for encoding in ("utf-8", "utf-8-sig", "utf-16"):
         directions = read_light_directions(put(tmp_path / "lights.txt", FORMS[form], encoding), 4)
@@ -83,14 +83,13 @@ def test_directions_round_trip(vectors, separator, counted, transposed):
             Path(folder, "lights.txt"), "\n".join(([str(len(values))] if counted else []) + rows)
         )
         directions = read_light_directions(path, len(values))
-    expected = unit(values)
-    assert_allclose(directions, expected, rtol=1e-12, atol=1e-15)
+    assert_allclose(directions, unit(values), rtol=1e-12, atol=1e-15)
 
 
 COMMA = "A comma separates columns; write decimals with a point."
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "text, line, message",
     [
         ("0 0 1\n\n0 1\n0 1 1", 3, "found 2 columns, expected 3 as in the other lines"),
@@ -127,7 +126,8 @@ def test_wrong_directions(tmp_path, text, line, message):
     assert str(caught.value).startswith(
         f"{path}: {message}" if line is None else f"{path}:{line}: {message}"
     )
-    assert (caught.value.path, caught.value.line) == (path, line)
+    assert caught.value.path == path
+    assert caught.value.line == line
 
 
 def test_files_that_are_no_text(tmp_path):
@@ -139,11 +139,9 @@ def test_files_that_are_no_text(tmp_path):
         ("lights.txt", r"the file is not UTF-8 text\. Save it as plain UTF-8 text\."),
         ("mask.png", r"found an image, expected a text file with a line x y z for each image\."),
     ):
-        with pytest.raises(InputError, match=message):
+        with refuses(message):
             read_light_directions(tmp_path / name)
-    with pytest.raises(
-        InputError, match=r"expected a text file with a line r g b for each image\."
-    ):
+    with refuses(r"expected a text file with a line r g b for each image\."):
         read_light_intensities(tmp_path / "mask.png", 3)
 
 
@@ -155,7 +153,7 @@ COLOURED = (
 GRAY = ("3\n1\n2\n5", "4\n3\n1\n2\n5", "3 1 2 5")
 
 
-@pytest.mark.parametrize("text", COLOURED + GRAY)
+@parametrize("text", COLOURED + GRAY)
 def test_intensities(tmp_path, text):
     """In rows, after a count, or in columns; gray ones count for every channel."""
     expected = (
@@ -163,27 +161,19 @@ def test_intensities(tmp_path, text):
         if text in GRAY
         else [[1, 2, 4], [2, 2, 2], [1, 1, 1], [3, 3, 3]]
     )
-    np.testing.assert_array_equal(
-        read_light_intensities(put(tmp_path / "lights.txt", text), 4), expected
-    )
+    assert_array_equal(read_light_intensities(put(tmp_path / "lights.txt", text), 4), expected)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "text, message",
-    [
-        ("1 1 1\n1 0 1\n1 1 1\n1 1 1", ":2: found the intensity 0, expected a number above 0."),
-        (
-            "1 1 1 1\n1 1 -2 1\n1 1 1 1",
-            ":2: found the intensity -2 in column 3, expected a number above 0.",
-        ),
-        ("1 1\n1 1\n1 1\n1 1", ":1: found 2 columns, expected 3 (R G B) or 1 (gray)."),
-        ("1 1 1\n1 inf 1\n1 1 1\n1 1 1", ':2: found "inf", expected a finite number.'),
-        ("1 1 1\n1 1 1", ": found 2 light intensities, expected 4, one for each image."),
-        (
-            "1 1 1\n1 1e308 1\n1 1 1\n1 1 1",
-            ":2: found the intensity 1e+308, expected a number from 1e-12 to",
-        ),
-    ],
+    r"""
+1 1 1\n1 0 1\n1 1 1\n1 1 1 | :2: found the intensity 0, expected a number above 0.
+1 1 1 1\n1 1 -2 1\n1 1 1 1 | :2: found the intensity -2 in column 3, expected a number above 0.
+1 1\n1 1\n1 1\n1 1 | :1: found 2 columns, expected 3 (R G B) or 1 (gray).
+1 1 1\n1 inf 1\n1 1 1\n1 1 1 | :2: found "inf", expected a finite number.
+1 1 1\n1 1 1 | : found 2 light intensities, expected 4, one for each image.
+1 1 1\n1 1e308 1\n1 1 1\n1 1 1 | :2: found the intensity 1e+308, expected a number from 1e-12 to
+""",
 )
 def test_wrong_intensities(tmp_path, text, message):
     path = put(tmp_path / "lights.txt", text)
@@ -192,15 +182,15 @@ def test_wrong_intensities(tmp_path, text, message):
     assert str(caught.value).startswith(f"{path}{message}")
 
 
-@pytest.mark.parametrize("n_images", [None, 4])
+@parametrize("n_images", [None, 4])
 def test_one_light_in_each_column_is_no_count(tmp_path, n_images):
     # The first column, 1 3 2, would count three lights.
     path = put(tmp_path / "lights.txt", "1 0 0 1\n3 1 0 0\n2 1 1 1")
-    expected = np.array([[1.0, 3, 2], [0, 1, 1], [0, 0, 1], [1, 0, 1]])
+    expected = vectors("1 3 2; 0 1 1; 0 0 1; 1 0 1")
     assert_allclose(read_light_directions(path, n_images), unit(expected))
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "text",
     [
         "image,x,y,z\nimg10.png,-0.48,0.36,0.8\nimg2.png,0.6,0,0.8\nimg1.png,0,0,1\nimg3.png,0,-0.6,0."
@@ -212,7 +202,7 @@ def test_one_light_in_each_column_is_no_count(tmp_path, n_images):
     ],
     ids=["csv", "paths", "header", "stems"],
 )
-@pytest.mark.parametrize("stem", ["img", "2024_0"])
+@parametrize("stem", "img 2024_0")
 def test_rows_that_name_their_image(tmp_path, text, stem):
     """A name such as 2024_01, which Python would read as a number, is a name."""
     table, directions = read_lights(put(tmp_path / "lights.txt", text.replace("img", stem)), 4)
@@ -223,7 +213,7 @@ def test_rows_that_name_their_image(tmp_path, text, stem):
     assert_allclose([found[image] for image in wanted], DIRECTIONS, atol=1e-15)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "factors, message",
     [
         ([1, 2, 4, 8], None),
@@ -234,22 +224,23 @@ def test_rows_that_name_their_image(tmp_path, text, stem):
 def test_factors_of_a_dome_are_inverse_intensities(tmp_path, factors, message):
     path = tmp_path / "a.dome"
     lights = [dict(zip("xyz", row, strict=True)) for row in DIRECTIONS.tolist()]
-    path.write_text(
+    put(
+        path,
         json.dumps(
             {
                 "directions": lights,
                 "ledAdjust": [dict.fromkeys("rgb", factor) for factor in factors],
             }
-        )
+        ),
     )
     if message is None:
         assert_allclose(read_lights(path, 4)[0].intensities, 1 / np.tile(factors, (3, 1)).T)
     else:
-        with pytest.raises(InputError, match=message):
+        with refuses(message):
             read_lights(path, 4)
 
 
-@pytest.mark.parametrize("suffix", [".txt", ".npy", ".lp", ".csv"])
+@parametrize("suffix", ".txt .npy .lp .csv")
 def test_written_lights_are_read_again(tmp_path, suffix):
     path = tmp_path / f"lights{suffix}"
     path.write_bytes(
@@ -260,7 +251,7 @@ def test_written_lights_are_read_again(tmp_path, suffix):
         assert path.read_text().splitlines()[0] == "x,y,z"
 
 
-@pytest.mark.parametrize("text", ["0 90\n0 53.130102\n-90 53.130102\n143.130102 53.130102", None])
+@parametrize("text", ["0 90\n0 53.130102\n-90 53.130102\n143.130102 53.130102", None])
 def test_angles(tmp_path, text):
     # atan2(0.36, -0.48) = 143.13 degrees, asin(0.8) = 53.13 degrees.
     counted = "2 0 53.130102\n1 0 90\n3 270 53.130102\n4 143.130102 53.130102"
@@ -273,7 +264,7 @@ def test_angles(tmp_path, text):
 ADD_AZEL = ".*add --light-format azel"
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "form, text, message",
     [
         (
@@ -317,7 +308,7 @@ ADD_AZEL = ".*add --light-format azel"
     ],
 )
 def test_angles_and_vectors_are_not_mistaken_for_each_other(tmp_path, form, text, message):
-    with pytest.raises(InputError, match=message):
+    with refuses(message):
         read_lights(put(tmp_path / "lights.txt", text), text.count("\n") + 1, form=form)
 
 
@@ -329,12 +320,12 @@ def write_opencv(path, **matrices):
     return path
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".yml", ".yaml", ".xml", ".mat", "packed.mat"])
-@pytest.mark.parametrize("transposed", [False, True])
+@parametrize("suffix", ".npy .yml .yaml .xml .mat packed.mat")
+@parametrize("transposed", [False, True])
 def test_arrays(tmp_path, suffix, transposed):
     """Written by NumPy, OpenCV and SciPy themselves."""
     stored, path = (
-        5 * (DIRECTIONS.T if transposed else DIRECTIONS).astype(np.float32),
+        5 * np.float32(DIRECTIONS.T if transposed else DIRECTIONS),
         tmp_path / f"lights{suffix}",
     )
     if suffix == ".npy":
@@ -355,18 +346,16 @@ def test_refused_arrays(tmp_path):
         (np.ones((5, 3)), "found 5 light directions, expected 4"),
     ):
         np.save(tmp_path / "lights.npy", array, allow_pickle=True)
-        with pytest.raises(InputError, match=message):
+        with refuses(message):
             read_light_directions(tmp_path / "lights.npy", 4)
     savemat(tmp_path / "leds.mat", {"Dir": DIRECTIONS.T, "S": DIRECTIONS})
-    with pytest.raises(
-        InputError, match=r"several matrices N x 3 or 3 x N: Dir \(3 x 4\), S \(4 x 3\)"
-    ):
+    with refuses(r"several matrices N x 3 or 3 x N: Dir \(3 x 4\), S \(4 x 3\)"):
         read_light_directions(tmp_path / "leds.mat", 4)
-    with pytest.raises(InputError, match=r"no matrix N x 3 or 3 x N: K \(2 x 2\)"):
+    with refuses(r"no matrix N x 3 or 3 x N: K \(2 x 2\)"):
         read_light_directions(write_opencv(tmp_path / "k.yml", K=np.eye(2)), 4)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "name, content, problem",
     [
         ("a.yml", b"", "no matrix"),
@@ -392,11 +381,11 @@ def test_refused_arrays(tmp_path):
 )
 def test_damaged_matrices(tmp_path, name, content, problem):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(InputError, match=problem):
+    with refuses(problem):
         read_light_directions(tmp_path / name, 3)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "name, start, unit",
     [
         ("a.yml", "", "\n"),
@@ -409,8 +398,8 @@ def test_damaged_matrices(tmp_path, name, content, problem):
 def test_the_time_of_a_file_does_not_grow_with_the_square_of_its_length(
     tmp_path, name, start, unit
 ):
-    (tmp_path / name).write_text(start + unit * (900_000 // len(unit)))
+    put(tmp_path / name, start + unit * (900_000 // len(unit)))
     started = time.process_time()
-    with pytest.raises(InputError, match="no matrix"):
+    with refuses("no matrix"):
         read_light_directions(tmp_path / name, 3)
     assert time.process_time() - started < 3  # the square took minutes to hours

@@ -1,46 +1,37 @@
-"""Lights where people keep them: in other folders, in .mat and JSON files, and in names of images.
-
-The oracle is a matte sphere: wherever its lights are, the normals are those of its geometry.
-"""
+"""Lights where people keep them: in other folders, in .mat and JSON files, in names of images."""
 
 import json
 
 import cv2
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose
 from scipy.io import savemat
 
 import scenes
-from scenes import codes, put, to_uint16, write_image
-from splinecli.capture import CaptureOptions, find_captures, open_capture
+from capture.conftest import (
+    DISC,
+    LIGHTS,
+    LINES,
+    LP,
+    MASK,
+    NAMED,
+    NORMALS,
+    PICTURES,
+    check,
+    pictures,
+    xyz,
+)
+from scenes import codes, parametrize, pinhole, put, refuses, write_image
+from splinecli.capture import find_captures, open_capture
 from splinecli.capture.lights_in_names import lights_in_names
-from splinecli.errors import InputError
-from splinecli.estimate.inference import estimate_normals
-from splinecli.estimate.methods import make_estimator
-from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.recipe import RecipeOptions, prepare_capture
-
-NORMALS, DISC = scenes.sphere(32, 0.6)
-LIGHTS = scenes.spiral_lights(8, 40)
-LINES = "\n".join(" ".join(map(str, row)) for row in LIGHTS.tolist())
-NAMED = [(f"{number:03}.png", row) for number, row in enumerate(LIGHTS.tolist())]
-LP = "8\n" + "\n".join(f"{name} {x} {y} {z}" for name, (x, y, z) in NAMED)
+from splinecli.maths.normals import unit
+from splinecli.recipe import prepare_capture
 
 
-def pictures(lights=LIGHTS):
-    return to_uint16(np.moveaxis(scenes.shade(NORMALS, lights), -1, 0) * 50_000)
-
-
-def check(folder, **options):
-    """Compare the normals with the geometry, and return the source and its warnings."""
-    source = open_capture(folder, CaptureOptions(**options))
-    capture = prepare_capture(source, options=RecipeOptions(as_stored=True))
-    normals = estimate_normals(capture, make_estimator("ls")).normal_map
-    # 16-bit values as stored, without shadows: least squares is exact to a few thousandths of a
-    # degree.
-    inside = capture.mask & DISC
-    assert angle_between_deg(normals[inside], NORMALS[inside]).max() < 0.1
-    return source, codes(source)
+def checked(folder):
+    """The source of a capture whose normals are right, and its warnings."""
+    source = open_capture(folder)
+    return source, check(source)
 
 
 PLACES = {
@@ -54,49 +45,46 @@ PLACES = {
 }
 
 
-@pytest.mark.parametrize("of_images", ["", "images"])
-@pytest.mark.parametrize("name", PLACES)
+@parametrize("of_images", ["", "images"])
+@parametrize("name", PLACES)
 def test_light_files_in_other_places(tmp_path, name, of_images):
     folder = tmp_path / "all/owl"
-    scenes.write_capture(folder / of_images, pictures(), None)
+    scenes.write_capture(folder / of_images, PICTURES, None)
     put(folder / name, PLACES[name])
     put(tmp_path / "all/cat.lp", LP.replace("0.0", "0.9"))
     (tmp_path / "all/cat").mkdir()  # which owns the other file
-    source, found = check(folder)
+    source, found = checked(folder)
     assert found == ["lights_found"] and source.files.name == "owl"
     assert str((folder / name).resolve()) in str(source.warnings[0])
     assert find_captures(folder) == [folder]
 
 
 def test_lights_among_the_images_of_a_folder_inside(tmp_path):
-    scenes.write_capture(tmp_path / "images", pictures(), LIGHTS)
-    assert check(tmp_path)[1] == ["lights_found"]
+    scenes.write_capture(tmp_path / "images", PICTURES, LIGHTS)
+    assert check(open_capture(tmp_path)) == ["lights_found"]
 
 
 def test_a_folder_of_images_beside_the_lights(tmp_path):
-    scenes.write_capture(tmp_path / "owl/Images", pictures(), None, mask=DISC)
+    scenes.write_capture(tmp_path / "owl/Images", PICTURES, None, mask=DISC)
     put(tmp_path / "owl/Lights/lights.txt", LINES)
     for folder in (tmp_path / "owl", tmp_path / "owl/Images"):
-        source, found = check(folder)
-        assert (found, source.name) == (["lights_found"], "owl")
+        source, found = checked(folder)
+        assert found == ["lights_found"]
+        assert source.name == "owl"
         assert (source.read_mask(DISC.shape) == DISC).all()
 
 
 def test_files_that_do_not_fit_or_differ(tmp_path):
-    folder = scenes.write_capture(tmp_path / "all/owl", pictures(), None)
+    folder = scenes.write_capture(tmp_path / "all/owl", PICTURES, None)
     put(tmp_path / "all/lights.txt", LINES + "\n0 0 1")
-    with pytest.raises(InputError, match=r"found 8 images \(000.png, .* Pass --lights FILE"):
+    with refuses(r"found 12 images \(000.png, .* Pass --lights FILE"):
         open_capture(folder)
     put(folder / "Lights/a.txt", LINES)
     put(folder / "Lights/b.txt", LINES)
-    assert check(folder)[1] == ["lights_found"]
+    assert check(open_capture(folder)) == ["lights_found"]
     put(folder / "Lights/b.txt", "\n".join(LINES.splitlines()[::-1]))
-    with pytest.raises(InputError, match=r"2 files that fit the images: a\.txt, b\.txt"):
+    with refuses(r"2 files that fit the images: a\.txt, b\.txt"):
         open_capture(folder)
-
-
-def xyz(row):
-    return dict(zip("xyz", row, strict=True))
 
 
 OBJECTS = {
@@ -122,38 +110,38 @@ OBJECTS = {
 }
 
 
-@pytest.mark.parametrize("case", OBJECTS)
+@parametrize("case", OBJECTS)
 def test_json_objects(tmp_path, case):
-    folder = scenes.write_capture(tmp_path, pictures(), None)
+    folder = scenes.write_capture(tmp_path, PICTURES, None)
     put(folder / "lights.json", json.dumps(OBJECTS[case]))
-    assert check(folder)[1] == []
+    assert check(open_capture(folder)) == []
     for damaged in ([{"file": 1}], [{"file": "a"}, 3], [{"light_dir": [1]}], {"a": {"b": {}}}):
         put(folder / "lights.json", json.dumps(damaged))
-        with pytest.raises(InputError, match='found no list "lights"'):
+        with refuses('found no list "lights"'):
             open_capture(folder)
 
 
-IMAGES = np.moveaxis(pictures(), 0, -1)
+IMAGES = np.moveaxis(PICTURES, 0, -1)
 MAT = {
-    "I, L, mask": {"I": IMAGES, "L": LIGHTS, "mask": DISC.astype(np.uint8)},
+    "I, L, mask": {"I": IMAGES, "L": LIGHTS, "mask": MASK},
     "I, S, M": {"I": IMAGES / 65535, "S": LIGHTS.T, "M": DISC.astype(float)},
     "colour": {"images": np.repeat(IMAGES[:, :, None], 3, axis=2), "lights": LIGHTS, "mask": DISC},
-    "as NumPy has it": {"imgs": pictures(), "light_directions": LIGHTS, "mask": DISC},
+    "as NumPy has it": {"imgs": PICTURES, "light_directions": LIGHTS, "mask": DISC},
     "with normals": {"I": IMAGES, "S": LIGHTS, "N": NORMALS, "mask": DISC},
     "numbered": {
         "mask": DISC,
-        **{f"im{number}": picture for number, picture in enumerate(pictures())},
+        **{f"im{number}": picture for number, picture in enumerate(PICTURES)},
         **{f"l{number}": light[None] for number, light in enumerate(LIGHTS)},
     },
 }
 
 
-@pytest.mark.parametrize("compressed", [False, True])
-@pytest.mark.parametrize("case", MAT)
+@parametrize("compressed", [False, True])
+@parametrize("case", MAT)
 def test_mat_files(tmp_path, case, compressed):
     savemat(tmp_path / "owl.mat", MAT[case], do_compression=compressed)
-    source, found = check(tmp_path)
-    assert found == [] and source.n_lights == 8 and source.files.images[2].name == "owl.mat[2]"
+    source, found = checked(tmp_path)
+    assert found == [] and source.n_lights == 12 and source.files.images[2].name == "owl.mat[2]"
     assert (source.read_mask(DISC.shape) == DISC).all()
     stamp = source.stamp
     savemat(tmp_path / "owl.mat", {**MAT[case], "x": 1})
@@ -162,14 +150,14 @@ def test_mat_files(tmp_path, case, compressed):
 
 def test_mat_files_that_are_not_read(tmp_path):
     put(tmp_path / "a.mat", "MATLAB 7.3 MAT-file" + 300 * " ")
-    with pytest.raises(InputError, match=r"a\.mat: found a MATLAB 7\.3 file, .* -v7\."):
+    with refuses(r"a\.mat: found a MATLAB 7\.3 file, .* -v7\."):
         open_capture(tmp_path)
     savemat(tmp_path / "a.mat", {"I": np.zeros((4, 5), object)})
-    with pytest.raises(InputError, match=r"no images, but 1 \.mat file\. .* numeric array H x W x"):
+    with refuses(r"no images, but 1 \.mat file\. .* numeric array H x W x"):
         open_capture(tmp_path)
     for name in "ab":
         savemat(tmp_path / f"{name}.mat", MAT["I, L, mask"])
-    with pytest.raises(InputError, match=r"2 \.mat files with photographs \(a\.mat, b\.mat\)"):
+    with refuses(r"2 \.mat files with photographs \(a\.mat, b\.mat\)"):
         open_capture(tmp_path)
 
 
@@ -200,20 +188,20 @@ IN_NAMES = {
 }
 
 
-@pytest.mark.parametrize("case", IN_NAMES)
+@parametrize("case", IN_NAMES)
 def test_lights_in_names(tmp_path, case):
     lights = unit(np.array([*IN_NAMES[case].values()], np.float64))
     for name, picture in zip(IN_NAMES[case], pictures(lights), strict=True):
         write_image(tmp_path / f"{name}.png", picture)
-    write_image(tmp_path / "owl_mask.pgm", DISC.astype(np.uint8) * 255)
-    source, found = check(tmp_path)
+    write_image(tmp_path / "owl_mask.pgm", MASK)
+    source, found = checked(tmp_path)
     assert found == ["lights_found", "mask_choice"]
     assert "were read from the names of the images: " in str(source.warnings[0])
     put(tmp_path / "lights.lp", "\n".join(f"{name} 0 0 1" for name in IN_NAMES[case]))
     assert (open_capture(tmp_path).light_directions == (0, 0, 1)).all()  # a file takes precedence
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "names", ["a_1_2 a_3_4 a_5_6", "left right top owl cat", "left_a right_b top_c", "a-1_1 a-1_2"]
 )
 def test_names_without_lights(tmp_path, names):
@@ -237,7 +225,7 @@ def test_near_ps(tmp_path):
     """Lamps of near_ps are the same as those in light_positions.txt and light_lobes.txt."""
     folder = scenes.write_bump(tmp_path / "bump")
     (width, focal, distance), (u, v) = (2.0, 600.0, 1200.0), (15.0, 17.0)
-    matrix = np.array([[focal, 0, u], [0, focal, v], [0, 0, 1]])
+    matrix = pinhole(focal, u, v)
     np.savetxt(folder / "light_positions.txt", scenes.BUMP_LAMPS)
     axes = unit(-scenes.BUMP_LAMPS)
     np.savetxt(folder / "light_lobes.txt", np.column_stack((axes, np.full(len(axes), 1.5))))
@@ -260,24 +248,24 @@ def test_near_ps(tmp_path):
     }
     savemat(folder / "light.mat", lamps)
     savemat(folder / "camera.mat", {"K": matrix})
-    with pytest.raises(InputError, match=r"light\.mat: the scale .* Add --pixel-size: the"):
+    with refuses(r"light\.mat: the scale .* Add --pixel-size: the"):
         open_capture(folder)
     put(folder / "pixel_size.txt", str(width))
     source = open_capture(folder)
-    np.testing.assert_allclose(source.light_intensities[:, 0], np.linspace(1, 2, len(axes)))
+    assert_allclose(source.light_intensities[:, 0], np.linspace(1, 2, len(axes)))
     found = prepare_capture(source).lamps
     assert expected is not None and found is not None
     for name in ("positions", "lobes", "reference_distances", "camera_matrix"):
-        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-9)
+        assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-9)
     (folder / "camera.mat").unlink()
-    with pytest.raises(InputError, match=r"relative to the camera, .* Add --camera-matrix and"):
+    with refuses(r"relative to the camera, .* Add --camera-matrix and"):
         open_capture(folder)
 
 
 def test_opencv_reads_what_cv2_writes(tmp_path):
     """A matrix in XML, with a name that only its place makes one of lights."""
-    folder = scenes.write_capture(tmp_path, pictures(), None)
+    folder = scenes.write_capture(tmp_path, PICTURES, None)
     file = cv2.FileStorage(str(folder / "lights.xml"), cv2.FILE_STORAGE_WRITE)
     file.write("L", LIGHTS)
     file.release()
-    assert check(folder)[1] == ["lights_found"]
+    assert check(open_capture(folder)) == ["lights_found"]

@@ -5,22 +5,31 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
-from scenes import codes, to_uint16, with_chunk, write_capture, write_image
+from scenes import (
+    codes,
+    parametrize,
+    refuses,
+    to_uint16,
+    vectors,
+    with_chunk,
+    write_capture,
+    write_image,
+)
 from splinecli.capture import CaptureOptions, RadiometricCalibration, open_capture
 from splinecli.capture.formats.facts import read_header
 from splinecli.capture.linearise import linear_light
-from splinecli.errors import InputError
 from splinecli.recipe import prepare_capture, read_capture
 
-LIGHTS = np.array([(0, 0, 1), (0.5, 0, 1), (0, 0.5, 1), (-0.5, 0, 1)])
+LIGHTS = vectors("0 0 1; 0.5 0 1; 0 0.5 1; -0.5 0 1")
 
 
 @pytest.fixture
 def light():
     """What reached the camera: four images (4, 9, 11, 3)."""
-    return np.random.default_rng(0).uniform(0.05, 0.6, (4, 9, 11, 3))
+    return default_rng(0).uniform(0.05, 0.6, (4, 9, 11, 3))
 
 
 def store(folder, images):
@@ -57,10 +66,10 @@ def test_transfer_curves_are_undone(tmp_path, light):
     assert np.abs(observed(tmp_path / "srgb") - expected(light)).max() > 0.1
 
 
-@pytest.mark.parametrize("found", [True, False], ids=["found", "named"])
-@pytest.mark.parametrize("gamma", [1.0, None])
+@parametrize("found", [True, False], ids=["found", "named"])
+@parametrize("gamma", [1.0, None])
 def test_ambient_light_is_taken_off(tmp_path, light, gamma, found):
-    ambient = np.random.default_rng(1).uniform(0, 0.3, light.shape[1:])
+    ambient = default_rng(1).uniform(0, 0.3, light.shape[1:])
     encode = srgb if gamma is None else np.asarray
     folder = store(tmp_path / "capture", encode(light + ambient))
     path = write((folder if found else tmp_path) / "Ambient.png", encode(ambient))
@@ -72,9 +81,9 @@ def test_ambient_light_is_taken_off(tmp_path, light, gamma, found):
     assert ("ambient_subtracted" in codes(capture)) == found
 
 
-@pytest.mark.parametrize("one", [True, False], ids=["one for all", "one each"])
+@parametrize("one", [True, False], ids=["one for all", "one each"])
 def test_falloff_is_divided_out(tmp_path, light, one):
-    falloff = np.random.default_rng(2).uniform(0.5, 1.5, light.shape)
+    falloff = default_rng(2).uniform(0.5, 1.5, light.shape)
     falloff = np.broadcast_to(falloff[:1], light.shape) if one else falloff
     folder = store(tmp_path / "capture", light * falloff)
     flats = tuple(
@@ -86,7 +95,7 @@ def test_falloff_is_divided_out(tmp_path, light, one):
 
 def test_some_pixels_are_as_among_all(tmp_path, light):
     """Under ambient light, with a flat field for all images and one for each."""
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     folder, wanted = store(tmp_path / "capture", light), np.array([3, 40, 41, 98])
     ambient = write(tmp_path / "ambient.png", rng.uniform(0, 0.05, light.shape[1:]))
     flats = tuple(
@@ -122,13 +131,12 @@ def test_files_that_do_not_fit(tmp_path, light):
         ({"flat_field": (small, small)}, "found 2 flat-field images, expected 1 or 4"),
         ({"flat_field": (black,)}, r"black\.png: the flat-field image is black"),
     ):
-        with pytest.raises(InputError, match=message):
+        with refuses(message):
             observed(folder, **settings)
 
 
 def test_images_that_say_they_are_for_a_screen(tmp_path, light):
-    plain = write(tmp_path / "plain.png", light[0])
-    png = plain.read_bytes()
+    png = write(tmp_path / "plain.png", light[0]).read_bytes()
     for name, content, encoded in (
         ("plain", png, False),
         ("srgb", with_chunk(png, b"sRGB", b"\0"), True),
@@ -163,8 +171,7 @@ def test_linear_8_bit_values_lie_between_rounded_and_cut_ones():
     """
     light = np.linspace(1, 254, 100_001) / 255
     rounded, cut = (
-        linear_light(steps(255 * light).astype(np.uint8), Path("a.png"))
-        for steps in (np.rint, np.floor)
+        linear_light(np.uint8(steps(255 * light)), Path("a.png")) for steps in (np.rint, np.floor)
     )
     assert (rounded - light).mean() * 255 == pytest.approx(0.25, abs=0.01)
     assert (cut - light).mean() * 255 == pytest.approx(-0.25, abs=0.01)
@@ -172,5 +179,5 @@ def test_linear_8_bit_values_lie_between_rounded_and_cut_ones():
     assert_allclose(linear_light(zero_and_one, Path("a.png")) * 255, (0, 1.25), rtol=1e-6)
     assert_allclose(linear_light(zero_and_one, Path("a.jpg"), 2.2) * 255**2.2, (0, 1), rtol=1e-5)
     assert_allclose(
-        linear_light(zero_and_one.astype(np.uint16), Path("a.png")) * 65_535, (0, 1), rtol=1e-6
+        linear_light(np.uint16(zero_and_one), Path("a.png")) * 65_535, (0, 1), rtol=1e-6
     )

@@ -7,7 +7,7 @@ import os
 import numpy as np
 import pytest
 
-from scenes import put, write_capture
+from scenes import parametrize, put, refuses, vectors, write_capture
 from splinecli.capture import (
     CaptureOptions,
     Overrides,
@@ -17,7 +17,6 @@ from splinecli.capture import (
     open_capture,
 )
 from splinecli.capture.files import digest
-from splinecli.errors import InputError
 
 
 def fill(folder, names):
@@ -42,7 +41,8 @@ def test_plain_folder_in_natural_order(tmp_path):
         "img04.jpeg",
         "img10.png",
     ]
-    assert (files.name, files.folder) == ("vase", folder)
+    assert files.name == "vase"
+    assert files.folder == folder
     assert files.light_directions == folder / "lights.txt"
     assert files.light_intensities == folder / "light_intensities.txt"
     assert files.mask == folder / "Mask.png"
@@ -105,7 +105,7 @@ def test_folders_that_are_no_capture(tmp_path):
         ),
         ("dark", Overrides(lights=tmp_path), r"found a folder, expected a file\."),
     ):
-        with pytest.raises(InputError, match=message):
+        with refuses(message):
             find_capture_files(tmp_path / name, overrides)
     assert find_capture_files(tmp_path / "dark", some).light_directions == tmp_path / "file"
 
@@ -121,8 +121,8 @@ def test_wrong_filenames_txt(tmp_path):
         ("a.png\na.png\n", r':2: the image "a.png" is already listed on line 1\.'),
         ("\n\n", r": the list contains no images\."),
     ):
-        (tmp_path / "filenames.txt").write_text(text)
-        with pytest.raises(InputError, match=f"filenames.txt{message}"):
+        put(tmp_path / "filenames.txt", text)
+        with refuses(f"filenames.txt{message}"):
             find_capture_files(tmp_path)
 
 
@@ -146,7 +146,7 @@ def test_find_captures_finds_none(tmp_path):
         ),
         ("nowhere", "the folder does not exist"),
     ):
-        with pytest.raises(InputError, match=message):
+        with refuses(message):
             find_captures(tmp_path / name)
 
 
@@ -155,8 +155,10 @@ def test_psbox(tmp_path):
     folder = fill(tmp_path / "demo", names)
     files = find_capture_files(folder)
     assert files.images == (folder / "Objects/b2.png", folder / "Objects/b10.png")
-    assert (files.name, files.light_directions) == ("demo", folder / "light_directions.txt")
-    assert (files.mask, files.ground_truth) == (None, None)
+    assert files.name == "demo"
+    assert files.light_directions == folder / "light_directions.txt"
+    assert files.mask is None
+    assert files.ground_truth is None
 
 
 def test_paths_that_the_system_refuses(tmp_path):
@@ -172,10 +174,10 @@ def test_paths_that_the_system_refuses(tmp_path):
             find_captures,
             lambda p: find_capture_files(folder, Overrides(lights=p)),
         ):
-            with pytest.raises(InputError, match=rf"{path.name}: cannot be read \({reason}\)\.$"):
+            with refuses(rf"{path.name}: cannot be read \({reason}\)\.$"):
                 call(path)
     (folder / "loop.png").symlink_to(folder / "loop.png")
-    with pytest.raises(InputError, match=r"loop\.png: cannot be read"):
+    with refuses(r"loop\.png: cannot be read"):
         find_capture_files(folder)
 
 
@@ -196,7 +198,7 @@ def folder(tmp_path, write_image):
     images = (
         np.full((3, 4, 5), 500, np.uint16) + 1000 * np.arange(3, dtype=np.uint16)[:, None, None]
     )
-    lights = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
+    lights = vectors("0 0 1; 0.6 0 0.8; 0 0.6 0.8")
     mask, normals = np.ones((4, 5), bool), np.tile(np.float32((0, 0, 1)), (4, 5, 1))
     return write_capture(
         tmp_path / "vase",
@@ -214,7 +216,7 @@ def stamp(folder):
     return digest(open_capture(folder, CaptureOptions(radiometry=flat)).stamp)
 
 
-@pytest.mark.parametrize("name", ["1.png", "../flat.png"])
+@parametrize("name", "1.png ../flat.png")
 def test_images_are_stamped_by_their_time(folder, name):
     before = stamp(folder)
     assert stamp(folder) == before
@@ -222,7 +224,7 @@ def test_images_are_stamped_by_their_time(folder, name):
     assert stamp(folder) != before
 
 
-@pytest.mark.parametrize("name", OTHERS)
+@parametrize("name", OTHERS)
 def test_other_files_are_stamped_by_their_content(folder, name, write_image):
     before = stamp(folder)
     content = (folder / name).read_bytes()
@@ -239,6 +241,6 @@ def test_pixel_sizes_are_stamped(folder):
     (folder / "light_directions.txt").rename(folder / "light_positions.txt")
     stamps = set()
     for size in ("0.1", "0.2"):
-        (folder / "pixel_size.txt").write_text(size)
+        put(folder / "pixel_size.txt", size)
         stamps.add(stamp(folder))
     assert len(stamps) == 2

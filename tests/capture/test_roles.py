@@ -2,26 +2,19 @@
 contact.
 """
 
+from pathlib import Path
+
 import numpy as np
-import pytest
 import tifffile
 from PIL import Image
 
 import scenes
-from scenes import codes, put, to_uint16, write_image
+from capture.conftest import DISC, LIGHTS, MASK, PICTURES, normals_by_ls
+from scenes import codes, on_sphere, parametrize, put, refuses, to_uint16, vectors, write_image
 from splinecli.capture import CaptureOptions, find_capture_files, open_capture
 from splinecli.capture.files import Overrides
-from splinecli.errors import InputError
-from splinecli.estimate.inference import estimate_normals
-from splinecli.estimate.methods import make_estimator
 from splinecli.lights.calibration.balls import find_ball_files
 from splinecli.maths.normals import angle_between_deg
-from splinecli.recipe import RecipeOptions, prepare_capture
-
-NORMALS, DISC = scenes.sphere(24, 0.8)
-LIGHTS = scenes.spiral_lights(6, 40)
-PICTURES = to_uint16(np.moveaxis(scenes.shade(NORMALS, LIGHTS), -1, 0) * 50_000)
-MASK = DISC.astype(np.uint8) * 255
 
 
 def write(path, picture):
@@ -32,61 +25,57 @@ def write(path, picture):
         write_image(path, np.dstack([picture] * 3) if path.suffix == ".ppm" else picture)
 
 
-@pytest.mark.parametrize("photographs", [".png", ".pgm", ".webp", ".jpg", "stack"])
-@pytest.mark.parametrize(
-    "mask",
-    [
-        "mask.pgm",
-        "mask.webp",
-        "owl_mask.png",
-        "face_mask.pgm",
-        "owlMask.webp",
-        "owlmask.png",
-        "stack_mask.tif",
-    ],
-)
+MASKS = """
+mask.pgm mask.webp mask_1.png owl_mask.png face_mask.pgm owlMask.webp stack_mask.tif owl.mask.tif
+../owl_mask.png ../owl.mask.bmp
+"""
+
+
+@parametrize("photographs", ".png .pgm .webp .jpg stack")
+@parametrize("mask", MASKS.split())
 def test_masks_in_every_format(tmp_path, photographs, mask):
+    folder = tmp_path / "owl"
+    write(folder / mask, MASK)
+    put(folder / "lights.txt")
+    np.savetxt(folder / "lights.txt", LIGHTS)
     if photographs == "stack":
-        tifffile.imwrite(tmp_path / "stack.tif", PICTURES, photometric="minisblack")
+        tifffile.imwrite(folder / "stack.tif", PICTURES, photometric="minisblack")
     else:
         for number, picture in enumerate(PICTURES):
-            write(tmp_path / f"{number}{photographs}", (picture >> 8).astype(np.uint8))
-    write(tmp_path / mask, MASK)
-    np.savetxt(tmp_path / "lights.txt", LIGHTS)
+            write(folder / f"{number}{photographs}", np.uint8(picture >> 8))
     for options in (CaptureOptions(), CaptureOptions(needs_lights=False)):
-        source = open_capture(tmp_path, options)
-        assert source.n_lights == 6 and (source.read_mask(DISC.shape) == DISC).all()
-        assert ("mask_choice" in codes(source)) != (mask in ("mask.pgm", "mask.webp"))
-    balls = find_ball_files(tmp_path)
-    assert len(balls.images) == 6 and balls.mask == source.files.mask
-
-
-@pytest.fixture
-def folder(tmp_path):
-    """Return a capture without a mask."""
-    return scenes.write_capture(tmp_path / "owl", PICTURES, LIGHTS)
+        source = open_capture(folder, options)
+        assert source.n_lights == 12 and (source.read_mask(DISC.shape) == DISC).all()
+        chosen = f"{Path(mask).name} is used as the mask. To use another one, pass"
+        found = any(str(warning).startswith(chosen) for warning in source.warnings)
+        assert found == ("mask_choice" in codes(source)) == (not mask.startswith("mask."))
+    balls = find_ball_files(folder)
+    assert len(balls.images) == 12 and balls.mask == source.files.mask
 
 
 def test_two_masks_are_named_by_all(folder):
     for name in ("a_mask.pgm", "b.mask.png"):
         write(folder / name, MASK)
+    write(folder / "small_mask.pgm", MASK[::2, ::2])
     text = (
         "No mask is used, because several files may be the mask: a_mask.pgm, b.mask.png. Choose"
         " one with --mask FILE."
     )
     source = open_capture(folder)
     assert codes(source) == ["mask_choice"] and str(source.warnings[0]) == text
-    assert source.n_lights == 6
+    assert source.n_lights == 12 and source.read_mask(DISC.shape).all()
     assert [str(warning) for warning in find_ball_files(folder).warnings] == [text]
-    with pytest.raises(InputError, match=text):
+    with refuses(text):
         open_capture(folder, CaptureOptions(needs_lights=False))
     mask = folder / "b.mask.png"
-    assert open_capture(folder, CaptureOptions(needs_lights=False, mask=mask)).n_lights == 6
+    assert open_capture(folder, CaptureOptions(needs_lights=False, mask=mask)).n_lights == 12
+    source = open_capture(folder, CaptureOptions(mask=mask))
+    assert codes(source) == ["images_left_out"] and (source.read_mask(DISC.shape) == DISC).all()
 
 
 def test_an_object_that_is_called_mask(tmp_path):
     folder = scenes.write_capture(tmp_path, PICTURES, LIGHTS, names="mask_{}.png")
-    assert open_capture(folder).n_lights == 6 and codes(open_capture(folder)) == []
+    assert open_capture(folder).n_lights == 12 and codes(open_capture(folder)) == []
 
 
 def test_a_preview_among_rare_formats_is_no_photograph(folder):
@@ -94,28 +83,27 @@ def test_a_preview_among_rare_formats_is_no_photograph(folder):
         write(folder / f"{number}.pgm", PICTURES[number])
         path.unlink()
     write(folder / "preview.png", MASK)
-    assert len(find_capture_files(folder, Overrides()).images) == 6
+    assert len(find_capture_files(folder, Overrides()).images) == 12
 
 
 def test_ambient_by_name(folder):
-    write(folder / "owl_Ambient.png", np.full((24, 24), 500, np.uint16))
+    write(folder / "owl_Ambient.png", np.full(DISC.shape, 500, np.uint16))
     source = open_capture(folder)
     assert codes(source) == ["ambient_subtracted"]
-    assert source.files.ambient == folder / "owl_Ambient.png" and source.n_lights == 6
-    write(folder / "ambient_2.png", np.full((24, 24), 900, np.uint16))
+    assert source.files.ambient == folder / "owl_Ambient.png" and source.n_lights == 12
+    write(folder / "ambient_2.png", np.full(DISC.shape, 900, np.uint16))
     source = open_capture(folder)  # it is unclear which
     assert codes(source) == ["images_left_out"] and source.files.ambient is None
 
 
-GEL_LIGHTS = np.array([(0, 0.8, 0.6), (-0.6, -0.4, 0.69), (0.6, -0.5, 0.62)])
+GEL_LIGHTS = vectors("0 0.8 0.6; -0.6 -0.4 0.69; 0.6 -0.5 0.62")
 
 
 def write_gel(folder, names):
     """Write a flat gel, unevenly lit by unequal coloured lamps, and the same with a ball in it."""
     y, x = np.indices((48, 64))
     inside = np.hypot(x - 30, y - 22) < 10
-    nx, ny = (x - 30) / 20 * inside, (22 - y) / 20 * inside
-    normals = np.stack((nx, ny, np.sqrt(1 - nx**2 - ny**2)), axis=-1)
+    normals = on_sphere((x - 30) / 20 * inside, (22 - y) / 20 * inside)
     uneven = (0.6 - 0.2 * ((x - 32) / 32) ** 2)[..., None] * (1.0, 0.8, 0.6)
     flat = np.broadcast_to((0.0, 0, 1), normals.shape)
     for name, surface in zip(names, (flat, normals), strict=True):
@@ -125,14 +113,13 @@ def write_gel(folder, names):
     return normals
 
 
-@pytest.mark.parametrize("reference", ["ref", "Background", "gel_empty", "no-contact", "000"])
+@parametrize("reference", "ref Background gel_empty no-contact 000")
 def test_a_gel_without_contact_is_the_flat_field(tmp_path, reference):
     normals = write_gel(tmp_path, (f"{reference}.png", "press.png"))
     options = CaptureOptions(lights_in_channels=True)
     source = open_capture(tmp_path, options)
     assert codes(source) == ["flat_field_choice", "lights_in_channels"]
-    capture = prepare_capture(source, options=RecipeOptions(as_stored=True))
-    found = estimate_normals(capture, make_estimator("ls")).normal_map
+    _, found = normals_by_ls(source)
     # Divided by the picture without contact, uneven and unequal lamps leave no trace.
     assert angle_between_deg(found, normals).max() < 0.1
     (tmp_path / "flats").mkdir()
@@ -144,17 +131,17 @@ def test_a_gel_of_which_no_picture_is_clearly_without_contact(tmp_path):
     write_gel(tmp_path, ("other.png", "1.png"))
     write_gel(tmp_path, ("other.png", "2.png"))
     (tmp_path / "other.png").unlink()
-    with pytest.raises(InputError, match=r"found 2 images .* but lights for 1 in .* --flat-field"):
+    with refuses(r"found 2 images .* but lights for 1 in .* --flat-field"):
         open_capture(tmp_path, CaptureOptions(lights_in_channels=True))
-    with pytest.raises(InputError, match=r"shine at once, add --lights-in-channels"):
+    with refuses(r"shine at once, add --lights-in-channels"):
         open_capture(tmp_path)
     write_gel(tmp_path, ("ref.png", "3.png"))
-    with pytest.raises(InputError, match=r"expected 12, three .* a folder of its own"):
+    with refuses(r"expected 12, three .* a folder of its own"):
         open_capture(tmp_path, CaptureOptions(lights_in_channels=True))
 
 
 def test_too_few_photographs(tmp_path):
     write(tmp_path / "1.png", PICTURES[0])
     put(tmp_path / "output.txt", "1 2 3")
-    with pytest.raises(InputError, match=r"found 1 image \(1\.png\) .* at least three photographs"):
+    with refuses(r"found 1 image \(1\.png\) .* at least three photographs"):
         open_capture(tmp_path)

@@ -7,11 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
+from scenes import parametrize, put, refuses, vectors, write_image
 from splinecli.capture import CaptureOptions, open_capture
 from splinecli.capture.linearise import Window, parse_window
-from splinecli.errors import InputError, SplinecliError, UsageError
+from splinecli.errors import SplinecliError, UsageError
 from splinecli.estimate.inference import lighting_on
 from splinecli.lights.lighting import PixelLighting, flat_depth, surface_points
 from splinecli.maths.pixel_grid import pixel_rays
@@ -31,7 +32,7 @@ def on_image(mask, values):
     return image
 
 
-@pytest.mark.parametrize("crop, scale", WINDOWS)
+@parametrize("crop, scale", WINDOWS)
 def test_a_window_reads_a_part_of_the_whole(crop, scale):
     window = parse_window(crop, scale)
     whole = read_capture(MEDALLION, as_stored=True)
@@ -39,27 +40,28 @@ def test_a_window_reads_a_part_of_the_whole(crop, scale):
         open_capture(MEDALLION, CaptureOptions(window=window)),
         options=RecipeOptions(as_stored=True),
     )
-    np.testing.assert_array_equal(part.mask, window.of(whole.mask))
-    np.testing.assert_array_equal(part.ground_truth, window.of(whole.ground_truth))
+    assert_array_equal(part.mask, window.of(whole.mask))
+    assert_array_equal(part.ground_truth, window.of(whole.ground_truth))
     # Sums over the colours may round differently.
     expected = window.of(on_image(whole.mask, whole.observations))[part.mask]
     assert_allclose(part.observations, expected, rtol=1e-6)
     described = describe_capture(
         InfoOptions(capture=MEDALLION), InferOptions(crop=crop, scale=scale)
     )
-    assert (described["n_pixels"], described["reads"]) == (part.n_pixels, window.in_words())
+    assert described["n_pixels"] == part.n_pixels
+    assert described["reads"] == window.in_words()
 
 
-def test_ambient_and_flat_field_are_read_in_the_window(tmp_path):
+def test_ambient_and_flat_field_are_read_in_the_window(tmp_path, rng):
     """Both change from pixel to pixel, so other pixels of them would give other observations."""
     folder = tmp_path / "capture"
     shutil.copytree(MEDALLION, folder)
     shape = cv2.imread(str(folder / "01.png")).shape[:2]
-    pattern = np.random.default_rng(0).integers(1, 30, shape).astype(np.uint8)
-    cv2.imwrite(str(folder / "ambient.png"), pattern)
+    pattern = np.uint8(rng.integers(1, 30, shape))
+    write_image(folder / "ambient.png", pattern)
     flats = tmp_path / "flats"
     flats.mkdir()
-    cv2.imwrite(str(flats / "flat.png"), 255 - pattern)
+    write_image(flats / "flat.png", 255 - pattern)
     maps = []
     for crop, scale in ((None, None), WINDOWS[2]):
         options = InferOptions(method="ls", crop=crop, scale=scale, flat_field=str(flats))
@@ -71,7 +73,7 @@ def test_ambient_and_flat_field_are_read_in_the_window(tmp_path):
     assert_allclose(ratio, ratio[0], rtol=1e-4)
 
 
-@pytest.mark.parametrize("crop, scale", WINDOWS)
+@parametrize("crop, scale", WINDOWS)
 def test_results_are_a_part_of_those_of_the_whole(crop, scale, tmp_path):
     maps = {}
     for name, options in (("whole", (None, None)), ("part", (crop, scale))):
@@ -95,7 +97,7 @@ def test_windows_in_words():
     assert describe_capture(InfoOptions(capture=MEDALLION))["reads"] is None
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "crop, scale, problem",
     [
         ("1,2,3", None, "--crop is '1,2,3'; expected X,Y,W,H"),
@@ -107,25 +109,25 @@ def test_windows_in_words():
     ],
 )
 def test_values_that_mean_nothing_are_refused(crop, scale, problem):
-    with pytest.raises(UsageError, match=problem):
+    with refuses(problem, UsageError):
         InferOptions(crop=crop, scale=scale)
 
 
 def test_windows_that_do_not_fit_are_refused():
-    with pytest.raises(InputError, match="--crop 0,0,5000,5 is not inside the image of"):
+    with refuses("--crop 0,0,5000,5 is not inside the image of"):
         open_capture(MEDALLION, CaptureOptions(window=parse_window("0,0,5000,5", None)))
-    with pytest.raises(InputError, match="no pixel in the part that is read"):
+    with refuses("no pixel in the part that is read"):
         prepare_capture(
             open_capture(MEDALLION, CaptureOptions(window=parse_window("0,0,3,3", None)))
         )
 
 
-@pytest.mark.parametrize("crop, scale", WINDOWS)
-@pytest.mark.parametrize("near, perspective", [(True, False), (True, True), (False, True)])
+@parametrize("crop, scale", WINDOWS)
+@parametrize("near, perspective", [(True, False), (True, True), (False, True)])
 def test_a_part_is_lit_and_seen_as_in_the_whole(crop, scale, near, perspective, tmp_path):
     """Under near lamps, and by a near camera."""
     matrix = tmp_path / "camera.txt"
-    matrix.write_text("300 0 52\n0 300 61\n0 0 1\n")
+    put(matrix, "300 0 52\n0 300 61\n0 0 1\n")
     lamps = {"light_distance": 40.0, "pixel_size": 0.1} if near else {}
     images = []
     for options in ((None, None), (crop, scale)):
@@ -134,7 +136,7 @@ def test_a_part_is_lit_and_seen_as_in_the_whole(crop, scale, near, perspective, 
         capture = prepare_capture(record.open(MEDALLION), options=RecipeOptions(as_stored=True))
         lit = lighting_on(capture)(None, np.arange(capture.n_pixels)) if not near else None
         if near:
-            places = [places.astype(np.float64) for places in np.nonzero(capture.mask)]
+            places = [np.float64(places) for places in np.nonzero(capture.mask)]
             points = surface_points(  # type: ignore[call-arg]
                 capture.lamps, *places, np.full(capture.n_pixels, flat_depth(capture.lamps))
             )
@@ -150,7 +152,7 @@ def test_a_part_is_lit_and_seen_as_in_the_whole(crop, scale, near, perspective, 
 
 def test_the_width_of_a_part_is_not_that_of_the_object():
     options = InferOptions(crop="31,22,50,47", light_distance=400.0, object_width=10.0)
-    with pytest.raises(SplinecliError, match="--object-width needs the whole object in the image"):
+    with refuses("--object-width needs the whole object in the image", SplinecliError):
         options.open(MEDALLION)
     narrow = prepare_capture(
         InferOptions(scale="1/3", light_distance=400.0, object_width=10.0).open(MEDALLION)
@@ -162,7 +164,7 @@ def test_the_width_of_a_part_is_not_that_of_the_object():
 def test_the_camera_of_the_part_sees_the_same_rays():
     window, matrix = (
         Window((2, 1, 5, 4), 2, (7, 9)),
-        np.array([(90, 1, 3.5), (0, 80, 2.5), (0, 0, 1)]),
+        vectors("90 1 3.5; 0 80 2.5; 0 0 1"),
     )
     whole = pixel_rays(np.ones((7, 9), np.bool_), matrix).reshape(7, 9, 3)
     part = pixel_rays(np.ones((2, 3), np.bool_), window.camera(matrix)).reshape(2, 3, 3)

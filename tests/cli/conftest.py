@@ -15,23 +15,12 @@ import pytest
 import typer
 
 import scenes
-from scenes import read_json, to_uint16
+from scenes import read_json, to_uint16, vectors
 from splinecli.cli.main import main
 from splinecli.maths.normals import unit
 
 SIZE = 24
-LIGHTS = np.array(
-    [
-        (0, 0, 1),
-        (0.5, 0, 1),
-        (-0.5, 0, 1),
-        (0, 0.5, 1),
-        (0, -0.5, 1),
-        (0.4, 0.4, 1),
-        (-0.4, 0.4, 1),
-        (0.4, -0.4, 1),
-    ]
-)
+LIGHTS = vectors("0 0 1; 0.5 0 1; -0.5 0 1; 0 0.5 1; 0 -0.5 1; 0.4 0.4 1; -0.4 0.4 1; 0.4 -0.4 1")
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples/medallion"
 
 
@@ -54,7 +43,7 @@ def write_capture(folder):
     normals, lights = sphere_normals(), unit(LIGHTS)
     pictures = to_uint16(np.moveaxis(normals @ lights.T, 2, 0) * 60_000)
     disc = np.hypot(*scenes.square_grid(SIZE, 1 - 1 / SIZE)) < 1
-    truth = normals.astype(np.float32)
+    truth = np.float32(normals)
     return scenes.write_capture(
         folder, pictures, lights, mask=disc, normals=truth, names="image{}.png", first=1
     )
@@ -84,8 +73,8 @@ def medallion():
     return Path(shutil.copytree(EXAMPLE, "medallion"))
 
 
-def read_report(folder):
-    return read_json(folder / "report.json")
+def read_report(name="sphere"):
+    return read_json(f"out/{name}/report.json")
 
 
 class Run(NamedTuple):
@@ -96,11 +85,6 @@ class Run(NamedTuple):
     @property
     def json(self):
         return json.loads(self.out)
-
-
-def table(text: str) -> list[tuple[str, ...]]:
-    """The cells of a table whose lines have | between them."""
-    return [tuple(map(str.strip, line.split("|"))) for line in text.strip().splitlines()]
 
 
 COMMAND = cache(typer.main.get_command)
@@ -120,11 +104,16 @@ def run(capfd, monkeypatch):
     """Run the command line: run("infer sphere --json", "a name with spaces") -> Run.
 
     The exit code must be `code`, stdout `out` and stderr `err`, where given, with `says` in stderr.
+    An `input_error` says what follows with code 3, a `usage_error` with 2.
     """
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.setattr(typer.main, "get_command", COMMAND)
 
-    def call(command, *more, code=0, says=(), out=None, err=None):
+    def call(
+        command, *more, code=0, says=(), out=None, err=None, input_error=None, usage_error=None
+    ):
+        if input_error or usage_error:
+            code, says = (3, input_error) if input_error else (2, usage_error)
         found = main([*command.split(), *map(str, more)])
         result = checked(Run(found, *capfd.readouterr()), code, says)
         assert out in (None, result.out) and err in (None, result.err), result

@@ -5,50 +5,44 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scenes import halfway, read_image, read_json, to_uint16, write_capture, write_image
+from scenes import (
+    ball,
+    halfway,
+    names_in,
+    pinhole,
+    put,
+    read_image,
+    read_json,
+    to_uint16,
+    vectors,
+    write_capture,
+    write_image,
+    write_mirror_ball,
+)
 from splinecli.capture import read_light_directions
+from splinecli.maths.normals import angle_between_deg
 
-SIZE, CENTRE, RADIUS = (100, 120), (60.0, 48.0), 40.0
-LIGHTS = np.array([(0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (-0.48, 0.36, 0.8), (0.0, -0.6, 0.8)])
-
-
-def normals():
-    y, x = np.indices(SIZE)
-    nx, ny = (x - CENTRE[0]) / RADIUS, (CENTRE[1] - y) / RADIUS
-    inside = nx**2 + ny**2 < 1
-    return np.stack((nx, ny, np.sqrt(np.where(inside, 1 - nx**2 - ny**2, 0))), axis=-1), inside
+SIZE = (100, 120)
+NORMALS, INSIDE = ball(SIZE, 60, 48, 40)
+LIGHTS = vectors("0 0 1; 0.6 0 0.8; -0.48 0.36 0.8; 0 -0.6 0.8")
 
 
-def write_balls(folder, lights=LIGHTS, *, wall=0.2):
-    """Write images of a ball that shows each lamp as a soft spot, where the normal halves view and
-    light.
-    """
-    folder.mkdir()
-    n, inside = normals()
-    for number, half in enumerate(halfway(lights)):
-        spot = np.exp(-((np.degrees(np.arccos((n @ half).clip(-1, 1))) / 2) ** 2))
-        picture = np.where(inside, 0.02 + 0.9 * spot, wall)
-        write_image(folder / f"{number}.png", to_uint16(picture * 65535))
-    return folder
+def write_balls(name, lights=LIGHTS, wall=0.2):
+    return write_mirror_ball(Path(name), NORMALS, INSIDE, lights, wall=wall)
 
 
-def write_gray(folder, intensities):
-    n, inside = normals()
-    images = (
-        0.5
-        * np.array(intensities)[:, None, None]
-        * (n @ LIGHTS.T).clip(0).transpose(2, 0, 1)
-        * inside
-    )
-    return write_capture(folder, to_uint16(images * 65535), None, mask=inside, names="{}.png")
+def write_gray(intensities):
+    shading = (NORMALS @ LIGHTS.T).clip(0).transpose(2, 0, 1) * INSIDE
+    images = 0.5 * np.array(intensities)[:, None, None] * shading
+    write_capture(Path("gray"), to_uint16(images * 65535), None, mask=INSIDE, names="{}.png")
 
 
-def angles_deg(found, expected=LIGHTS):
-    return np.degrees(np.arccos((found * expected).sum(axis=1).clip(-1, 1)))
+def angles_deg(found):
+    return angle_between_deg(found, LIGHTS)
 
 
 def test_one_ball(run):
-    write_balls(Path("ball"))
+    write_balls("ball")
     result = run(
         "calibrate ball",
         says="from picture, 100 % of the outline visible",
@@ -62,7 +56,7 @@ def test_one_ball(run):
 
 
 def test_an_outline_given_by_the_user(document):
-    write_balls(Path("ball"))
+    write_balls("ball")
     report = document("calibrate ball --circle 60,48,40 -o out")
     assert report["balls"][0]["circle"] == {
         "x": 60.0,
@@ -80,9 +74,8 @@ def test_an_outline_given_by_the_user(document):
 def test_positions_need_the_camera(run):
     """Two balls side by side show distant lamps alike."""
     for name, pads in (("one", (0, 180)), ("two", (180, 0))):
-        for path in write_balls(Path(name)).iterdir():
-            picture = read_image(path)
-            write_image(path, np.pad(picture, ((0, 0), pads), constant_values=13107))
+        for path in write_balls(name).iterdir():
+            write_image(path, np.pad(read_image(path), ((0, 0), pads), constant_values=13107))
     circles = "--circle 60,48,40 --circle 240,48,40"
     result = run(
         f"calibrate one two {circles}",
@@ -92,7 +85,7 @@ def test_positions_need_the_camera(run):
         ),
     )
     assert not Path("calibration/light_positions.txt").exists()
-    matrix = np.array(((1000, 0, 149.5), (0, 1000, 49.5), (0, 0, 1)))
+    matrix = pinhole(1000, 149.5, 49.5)
     np.savetxt("matrix.txt", matrix)
     arguments = f"calibrate one two {circles} --overwrite --json --camera-matrix matrix.txt"
     report = run(arguments).json
@@ -100,13 +93,13 @@ def test_positions_need_the_camera(run):
     known = report["lamp_positions"]["known"]
     for name in ("light_positions.txt", "pixel_size.txt", "camera_matrix.txt"):
         assert Path("calibration", name).exists() == known
-    Path("matrix.txt").write_text("900 0\n0 900\n")
+    put("matrix.txt", "900 0\n0 900\n")
     result = run(arguments, code=3)
     assert "matrix.txt: found 2 x 2 numbers, expected 3 x 3" in result.out
 
 
 def test_the_normals_are_not_the_lights(run):
-    write_balls(Path("ball"))
+    write_balls("ball")
     np.savetxt("mistake.txt", halfway(LIGHTS))
     run(
         "calibrate ball --circle 60,48,40 --compare mistake.txt",
@@ -118,64 +111,56 @@ def test_the_normals_are_not_the_lights(run):
 
 
 def test_an_uncertain_outline(run):
-    write_balls(Path("one"))
-    mask = normals()[1].astype(np.uint8) * 255
+    write_balls("one")
+    mask = INSIDE.astype(np.uint8) * 255
     mask[:48] = 0
-    cv2.imwrite("half.png", mask)
+    write_image("half.png", mask)
     run(
         "calibrate one --mask half.png -o half",
         says="warning: one: the outline of the ball is uncertain (",
     )
 
 
-def write_on_disc(folder, lights=LIGHTS):
-    """Write images of a brushed ball on a bright round table, whose edge is as clear as its own."""
-    y, x = np.indices((260, 280))
-    nx, ny = (x - 120) / 40, (140 - y) / 40
-    inside = nx**2 + ny**2 < 1
-    n = np.stack((nx, ny, np.sqrt(np.where(inside, 1 - nx**2 - ny**2, 0))), axis=-1)
-    table = np.where(np.hypot(x - 140, y - 130) < 110, 0.15, 0.03)
-    for number, half in enumerate(halfway(lights)):
-        picture = np.where(inside, 0.02 + 0.9 * (n @ half).clip(0) ** 80, table)
-        write_image(folder / f"{number}.png", to_uint16(picture * 65535))
-
-
 def test_an_outline_that_may_not_be_the_balls(run):
-    write_on_disc(Path("disc"))
+    """A brushed ball on a bright round table, whose edge is as clear as its own."""
+    n, inside = ball((260, 280), 120, 140, 40)
+    round_table = np.where(ball(inside.shape, 140, 130, 110)[1], 0.15, 0.03)
+    for number, half in enumerate(halfway(LIGHTS)):
+        picture = np.where(inside, 0.02 + 0.9 * (n @ half).clip(0) ** 80, round_table)
+        write_image(f"disc/{number}.png", to_uint16(picture * 65535))
     run(
         "calibrate disc",
-        code=3,
-        says=(
+        input_error=(
             "disc: the circle in the images (centre 140, 130, radius 110 pixels) may not be the",
             "(centre 120, 140, radius 40 pixels) is also clear and contains all highlights.",
             "calibration/calibration.png shows it. Give the ball's circle with --circle X,Y,R,",
         ),
     )
-    assert [path.name for path in Path("calibration").iterdir()] == ["calibration.png"]
+    assert names_in("calibration") == {"calibration.png"}
     run("calibrate disc --circle 120,140,40 --overwrite", says="from --circle")
     assert angles_deg(read_light_directions("calibration/light_directions.txt", 4)).max() < 1.5
-    write_balls(Path("still"), LIGHTS[[1, 1, 1, 2]])
-    run("calibrate still -o still", code=3, says="the highlight does not move in most images")
+    write_balls("still", LIGHTS[[1, 1, 1, 2]])
+    run("calibrate still -o still", input_error="the highlight does not move in most images")
 
 
 def test_two_masks_of_a_ball_are_named(run):
-    write_balls(Path("ball"))
+    write_balls("ball")
     for name in ("ball.mask.pgm", "old_mask.png"):
-        cv2.imwrite(f"ball/{name}", normals()[1].astype(np.uint8) * 255)
+        write_image(f"ball/{name}", INSIDE.astype(np.uint8) * 255)
     says = "several files may be the mask: ball.mask.pgm, old_mask.png. Choose one with"
     run("calibrate ball", says=(says, "from picture"))
 
 
 def test_refusals(refuse):
-    write_balls(Path("ball"))
-    write_balls(Path("short"), LIGHTS[:3])
-    write_balls(Path("flat"), wall=0.02)
-    write_balls(Path("dark"), LIGHTS[:1])
-    cv2.imwrite("dark/1.png", np.full(SIZE, 900, np.uint16))
-    write_balls(Path("cut"))
+    write_balls("ball")
+    write_balls("short", LIGHTS[:3])
+    write_balls("flat", wall=0.02)
+    write_balls("dark", LIGHTS[:1])
+    write_image("dark/1.png", np.full(SIZE, 900, np.uint16))
+    write_balls("cut")
     for path in Path("cut").iterdir():
         write_image(path, read_image(path)[:, 35:])
-    write_gray(Path("gray"), [1, 1, 0, 1])
+    write_gray([1, 1, 0, 1])
     Path("empty").mkdir()
     Path("nothing").mkdir()
     Path("nothing/0.pgm").write_bytes(b"P5\n0 0\n255\n")
@@ -207,11 +192,11 @@ def test_refusals(refuse):
 
 
 def test_a_display_encoded_target_is_reported(run):
-    write_balls(Path("ball"))
-    write_gray(Path("gray"), [1.0, 1.0, 1.0, 1.0])
+    write_balls("ball")
+    write_gray([1.0, 1.0, 1.0, 1.0])
     for path in Path("gray").glob("[0-9].png"):
         picture = read_image(path)
-        write_image(path.with_suffix(".jpg"), (picture // 257).astype(np.uint8))
+        write_image(path.with_suffix(".jpg"), np.uint8(picture // 257))
         path.unlink()
     arguments = "calibrate ball --circle 60,48,40 --gray-ball gray --overwrite"
     asked = run(f"{arguments} --transfer linear").err  # the option that the warning below names

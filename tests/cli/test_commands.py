@@ -14,6 +14,7 @@ import pytest
 import typer
 
 from cli.test_schema import check
+from scenes import names_in, parametrize, put, run_python
 from splinecli.cli import console
 from splinecli.cli.console import Messages, explain
 from splinecli.cli.main import app
@@ -38,7 +39,7 @@ def test_home_folders_are_expanded(capture, run, monkeypatch):
     assert Path("sky.png").is_file()
     run("integrate ~/results/sphere --output=~/surface --format npy")
     assert Path("surface/depth.npy").is_file()
-    run("calibrate ~/sphere/light_directions.txt", code=3, says="sphere/light_directions.txt")
+    run("calibrate ~/sphere/light_directions.txt", input_error="sphere/light_directions.txt")
     # The weights are a name or a file.
     missing = run("infer ~/sphere --weights=~/none.safetensors --output=~/others", code=4).err
     assert str(capture.parent.absolute() / "none.safetensors") in missing
@@ -46,7 +47,7 @@ def test_home_folders_are_expanded(capture, run, monkeypatch):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX pipes")
-@pytest.mark.parametrize("closed", ["stdout", "both"])
+@parametrize("closed", "stdout both")
 def test_a_batch_is_finished_after_its_pipe_was_closed(closed, capture, make_capture):
     """`infer captures/* | head -1` and `infer captures/* 2>&1 | head -1` compute every capture."""
     make_capture("second")
@@ -54,30 +55,20 @@ def test_a_batch_is_finished_after_its_pipe_was_closed(closed, capture, make_cap
     Path("third/image3.png").write_bytes(b"no picture")
     read, write = os.pipe()
     os.close(read)
-    arguments = [
-        sys.executable,
-        "-u",
-        "-m",
-        "splinecli",
-        "infer",
-        str(capture),
-        "third",
-        "second",
-        "--method",
-        "ls",
-    ]
+    words = f"-u -m splinecli infer {capture} third second --method ls"
+    arguments = [sys.executable, *words.split()]
     done = subprocess.run(
         arguments, stdout=write, stderr=write if closed == "both" else subprocess.PIPE, text=True
     )
     os.close(write)
     assert done.returncode == 3
-    assert {path.name for path in Path("out").iterdir()} == {"index.html", "second", "sphere"}
+    assert names_in("out") == {"index.html", "second", "sphere"}
     if closed == "stdout":
         assert done.stderr.endswith("3 captures: 2 done, 1 failed; see out/index.html\n")
 
 
-@pytest.mark.parametrize("name", ["infer", "info", "calibrate", "integrate", "evaluate", "prepare"])
-@pytest.mark.parametrize(
+@parametrize("name", "infer info calibrate integrate evaluate prepare")
+@parametrize(
     "wrong", ["nowhere", "--magic", "--output", ""], ids=lambda text: text or "no argument"
 )
 def test_a_failure_is_a_json_document(name, wrong, run):
@@ -100,11 +91,18 @@ def test_a_failure_is_a_json_document(name, wrong, run):
         "error": result.err.removeprefix("splinecli: ").rstrip("\n"),
         "exit_code": result.code,
     }
-    assert (result.err.count("\n"), "nowhere" in result.err) == (1, missing)
+    assert result.err.count("\n") == 1
+    assert ("nowhere" in result.err) == missing
     assert run(f"{name} --magic", code=2).out == ""
 
 
-@pytest.mark.parametrize("command, skipped", [("evaluate", "capture"), ("prepare", "source")])
+@parametrize(
+    "command, skipped",
+    """
+evaluate | capture
+prepare | source
+""",
+)
 def test_a_subfolder_without_permission_is_skipped(
     command, skipped, make_capture, run_without_privileges
 ):
@@ -119,7 +117,7 @@ def test_a_subfolder_without_permission_is_skipped(
     assert "set/b: the folder cannot be read (Permission denied)" in entry["reason"]
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "variables, expected",
     [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active"), ({"GOMP_SPINCOUNT": "9"}, None)],
 )
@@ -131,14 +129,11 @@ def test_waiting_threads_sleep_unless_the_user_says_otherwise(variables, expecte
         for name, value in os.environ.items()
         if name not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
     }
-    call = [sys.executable, "-c", script]
-    done = subprocess.run(
-        call, capture_output=True, text=True, check=True, env={**clean, **variables}
-    )
+    done = run_python(script, check=True, env={**clean, **variables})
     assert done.stdout.splitlines()[-1] == str(expected)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "error, expected",
     [
         (
@@ -207,9 +202,8 @@ with Messages(quiet=False).progress("cat", 25) as advance:
 
 
 def test_messages_name_what_was_meant(run, tmp_path):
-    run("infer none --maps albedos", code=2, says="Did you mean albedo?")
-    run("infer none --maps reliefs", code=2, says="Did you mean relief?")
-    result = run("watch nowhere", code=3, says="nowhere")
-    assert "waiting" not in result.err
-    (tmp_path / "a.txt").write_text("no normals")
-    run(f"integrate {tmp_path / 'a.txt'}", code=3, says="found neither .npy, .mat, PNG, TIFF,")
+    run("infer none --maps albedos", usage_error="Did you mean albedo?")
+    run("infer none --maps reliefs", usage_error="Did you mean relief?")
+    assert "waiting" not in run("watch nowhere", input_error="nowhere").err
+    put(tmp_path / "a.txt", "no normals")
+    run(f"integrate {tmp_path / 'a.txt'}", input_error="found neither .npy, .mat, PNG, TIFF,")

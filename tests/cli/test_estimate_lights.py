@@ -10,7 +10,7 @@ import pytest
 
 from capture.formats.test_film import path_of_lamp, sphere_film, write_film
 from cli.test_schema import check
-from scenes import cap_directions, codes, shade, sphere, write_capture
+from scenes import cap_directions, codes, put, shade, sphere, write_capture, write_image
 from splinecli.maths.normals import angle_between_deg
 
 LIGHTS = cap_directions(10, 50, 4, even=True)
@@ -21,8 +21,8 @@ def unlit():
     """A matte sphere without a light file, `ball` in the working folder."""
     normals, inside = sphere(64)
     images = shade(normals, LIGHTS, noise=0.002) * inside[..., None]
-    pictures = np.moveaxis((images.clip(0, 1) * 60_000).astype(np.uint16), 2, 0)
-    truth = (normals * inside[..., None]).astype(np.float32)
+    pictures = np.moveaxis(np.uint16(images.clip(0, 1) * 60_000), 2, 0)
+    truth = np.float32(normals * inside[..., None])
     return write_capture(Path("ball"), pictures, None, mask=inside, normals=truth)
 
 
@@ -32,8 +32,7 @@ def test_infer(unlit, run, document):
     assert report["light_file"] is None
     assert "estimated_lights" in codes(report)
     assert {"light_directions.txt", "lights.png"} <= set(report["files"])
-    found = np.loadtxt("out/ball/light_directions.txt")
-    error = angle_between_deg(found, LIGHTS).mean()
+    error = angle_between_deg(np.loadtxt("out/ball/light_directions.txt"), LIGHTS).mean()
     assert error < 5 and error < 3 * np.mean(report["light_errors_deg"])
     picture = Path("out/ball/lights.png").read_bytes()
     assert cv2.imread("out/ball/lights.png") is not None
@@ -60,18 +59,18 @@ def test_lights_are_estimated_if_there_is_no_light_file(unlit, run, document):
     assert info["light_source"] == "estimated" and info["mask"] == "found in the images"
     for options in ("--strict", "--light-frame x-left", "--refine-lights"):
         says = ("--lights estimate", "splinecli calibrate")
-        run(f"infer {unlit} {options} -o other", code=3, says=says)
-    run(f"infer {unlit} --lights none.txt -o other", code=3, says="none.txt")
+        run(f"infer {unlit} {options} -o other", input_error=says)
+    run(f"infer {unlit} --lights none.txt -o other", input_error="none.txt")
     for image in sorted(unlit.glob("*.png"))[5:]:
         image.unlink()
-    run(f"infer {unlit} -o other", code=3, says="5 images")
+    run(f"infer {unlit} -o other", input_error="5 images")
     assert not Path("other").exists()
 
 
 def test_a_light_file_of_the_user_is_kept(unlit, run):
     """Here, the results go into the folder of the capture."""
     own = "\n".join("0 0 1" for _ in LIGHTS)
-    (unlit / "light_directions.txt").write_text(own)
+    put(unlit / "light_directions.txt", own)
     command = f"infer {unlit} --lights estimate --intensities equal --method ls -o ."
     run(command, code=5, says="not written by an earlier run")
     assert (unlit / "light_directions.txt").read_text() == own
@@ -93,13 +92,12 @@ def test_info(unlit, run, document):
 
 def test_evaluate(unlit, run):
     np.savetxt(unlit / "light_directions.txt", LIGHTS)
-    (unlit / "light_intensities.txt").write_text("1\n" * len(LIGHTS))
+    put(unlit / "light_intensities.txt", "1\n" * len(LIGHTS))
     arguments = f"evaluate {unlit} --method ls --n-lights 8 --trials 2 --json -o scores"
     given = run(arguments).json
-    result = run(
+    estimated = run(
         f"{arguments} --lights estimate", says="the mean error of the estimated light directions is"
-    )
-    estimated = result.json
+    ).json
     check(estimated, "Results")
     assert given["results"][0]["found_light_error_deg"] is None
     error = estimated["results"][0]["found_light_error_deg"]
@@ -114,15 +112,15 @@ def test_first_light(unlit, run):
     crop = f"infer {unlit} --crop 16,16,32,32 --lights estimate --method ls"
     for command in (crop, f"info {unlit} --crop 16,16,32,32 --lights estimate"):
         says = ("--mask FILE", "the light of 000.png comes from: --first-light left, upper-left")
-        result = run(command, code=3, says=says)
+        result = run(command, input_error=says)
         assert result.err.startswith("splinecli: ball: the images do not show whether")
     side = str(np.degrees(np.arctan2(LIGHTS[0, 1], LIGHTS[0, 0])))
     run(f"{crop} --first-light {side}")
     assert angle_between_deg(np.loadtxt("out/ball/light_directions.txt"), LIGHTS).mean() < 15
     np.savetxt(unlit / "light_directions.txt", LIGHTS)
-    run(f"infer {unlit} --first-light {side} -o given", code=2, says="Add --lights estimate")
+    run(f"infer {unlit} --first-light {side} -o given", usage_error="Add --lights estimate")
     words = "found 'north' as the side of the first light, expected one of right,"
-    run(f"{crop} --first-light north", code=2, says=words)
+    run(f"{crop} --first-light north", usage_error=words)
 
 
 def test_contradictions(unlit, run):
@@ -135,8 +133,8 @@ def test_contradictions(unlit, run):
         "evaluate --refine-lights",
         "evaluate --light-noise-deg 2",
     ):
-        run(f"{command} {unlit} --lights estimate", code=2, says="--lights estimate")
-    run(f"info {unlit} --check-lights", code=2, says="but the lights are estimated")
+        run(f"{command} {unlit} --lights estimate", usage_error="--lights estimate")
+    run(f"info {unlit} --check-lights", usage_error="but the lights are estimated")
     assert not Path("out").exists()
 
 
@@ -144,7 +142,7 @@ def test_a_film(run, document):
     lights = path_of_lamp(120)
     film = write_film(Path("clip.avi"), sphere_film(lights))
     mask = sphere(96)[1]
-    assert cv2.imwrite("mask.png", mask.astype(np.uint8) * 255)
+    write_image("mask.png", np.uint8(mask) * 255)
     command = f"infer {film} --lights estimate --mask mask.png --method ls"
     report = document(command)
     check(report, "Report")
@@ -202,6 +200,6 @@ def test_a_planted_record_of_a_film_deletes_nothing(run):
     own.write_bytes(b"mine")
     frames = dict.fromkeys([own.name, *(f"frame-00000{i}.png" for i in range(6))], 4)
     record = {"film": "x", "sha256": "y", "frames": frames}
-    Path("out/frames/clip/film.json").write_text(json.dumps(record))
+    put("out/frames/clip/film.json", json.dumps(record))
     run(f"infer {film} --lights estimate --update", code=5)
     assert own.read_bytes() == b"mine"

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scenes import read_json, to_uint16, write_capture, write_image
+from scenes import names_in, parametrize, read_json, to_uint16, write_capture, write_image
 from splinecli.maths.normals import unit
 
 
@@ -17,8 +17,7 @@ def dataset(make_capture):
     drawn.
     """
     make_capture("data/matte")
-    shaded = make_capture("data/shaded")
-    write_image(shaded / "image1.png", np.zeros((24, 24), np.uint16))
+    write_image(make_capture("data/shaded") / "image1.png", np.zeros((24, 24), np.uint16))
     return Path("data")
 
 
@@ -42,8 +41,7 @@ def overexposed(make_capture):
     """
     folder = make_capture("overexposed")
     y, x = np.mgrid[0.8:-0.8:24j, -0.8:0.8:24j]
-    height = np.sqrt(np.maximum(1 - x**2 - y**2, 0.1))
-    normals = unit(np.stack((x, y, height), axis=2))
+    normals = unit(np.stack((x, y, np.sqrt(np.maximum(1 - x**2 - y**2, 0.1))), axis=2))
     intensities = np.array((1.0, 0.8, 1.2, 0.7, 1.3, 0.9, 1.1, 1.0))
     images = (
         np.clip(0.9 * intensities * (normals @ np.loadtxt(folder / "light_directions.txt").T), 0, 1)
@@ -51,11 +49,17 @@ def overexposed(make_capture):
     )
     pictures = to_uint16(np.moveaxis(images, 2, 0))
     return write_capture(
-        folder, pictures, None, normals=normals.astype(np.float32), names="image{}.png", first=1
+        folder, pictures, None, normals=np.float32(normals), names="image{}.png", first=1
     )
 
 
-@pytest.mark.parametrize("method, lights", [("iw12", ""), ("ls", "--n-lights 7 --seed 3")])
+@parametrize(
+    "method, lights",
+    """
+iw12 |
+ls | --n-lights 7 --seed 3
+""",
+)
 def test_infer_and_evaluate_give_the_same_figure(overexposed, document, method, lights):
     """The draw of `infer` is the first of `evaluate`."""
     figures = []
@@ -65,7 +69,8 @@ def test_infer_and_evaluate_give_the_same_figure(overexposed, document, method, 
         evaluation = document(f"evaluate --trials 1 {shared} {lights or '--n-lights all'}")
         (result,) = evaluation["results"]
         assert result["mae_deg"] == pytest.approx(report["angular_error_deg"]["mean"], abs=1e-4)
-        assert (evaluation["protocol"]["as_stored"], report["reading"]) == (bool(policy), reading)
+        assert evaluation["protocol"]["as_stored"] == bool(policy)
+        assert report["reading"] == reading
         figures.append(result["mae_deg"])
     restored, as_stored = figures
     assert restored < as_stored / 2
@@ -163,15 +168,14 @@ def test_figures(dataset, run):
         for name in ("matte", "shaded")
         for suffix in ("", "_observation_maps")
     ]
-    assert sorted(path.name for path in Path("evaluation/figures").iterdir()) == sorted(names)
+    assert names_in("evaluation/figures") == set(names)
     maps = cv2.imread("evaluation/figures/shaded.png")
     assert maps.shape[1] > maps.shape[0]
     assert Path("evaluation/report.html").read_text().count("data:image/png") == 4
     # The results are there although no figure can be drawn, and earlier figures are gone.
     run(
         f"evaluate {dataset} --method spline-net {arguments.replace('12,5', '0,0')}",
-        code=3,
-        says="no figure: the pixel in row 0, column 0 of matte has no ground truth",
+        input_error="no figure: the pixel in row 0, column 0 of matte has no ground truth",
     )
     assert "spline-net" in Path("evaluation/table.md").read_text()
     assert not list(Path("evaluation/figures").iterdir())
@@ -195,6 +199,7 @@ def test_the_white_level_is_used_and_named(overexposed, document):
     """A level below the image values makes the values above it saturated, so they are restored."""
     arguments = f"evaluate {overexposed} --method ls --n-lights all"
     plain, lower = document(arguments), document(f"{arguments} --white-level 50000")
-    assert (plain["protocol"]["white_level"], lower["protocol"]["white_level"]) == (None, 50_000)
+    assert plain["protocol"]["white_level"] is None
+    assert lower["protocol"]["white_level"] == 50_000
     assert lower["results"][0]["mae_deg"] != plain["results"][0]["mae_deg"]
     assert "white level 50000, images restored" in Path("evaluation/table.md").read_text()

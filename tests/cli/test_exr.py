@@ -6,20 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
-from scenes import read_image
+from scenes import parametrize, read_image
 
 
 def read(path):
     """The header of an EXR file and its channels, each on its own."""
-    library = pytest.importorskip("OpenEXR")
-    file = library.File(str(path), separate_channels=True)
+    file = pytest.importorskip("OpenEXR").File(str(path), separate_channels=True)
     return file.header(), {name: channel.pixels for name, channel in file.channels().items()}
 
 
-@pytest.mark.parametrize("convention", ["opengl", "directx"])
+@parametrize("convention", "opengl directx")
 def test_maps_of_infer(capture, run, convention):
     pytest.importorskip("OpenEXR")
     options = f"--method ls --maps albedo --surface --convention {convention}"
@@ -44,13 +43,13 @@ def test_maps_of_infer(capture, run, convention):
     header, channels = read(out / "depth.exr")
     depth = np.load(out / "depth.npy")
     assert header["unit"] == "pixel"
-    np.testing.assert_array_equal(channels["Y"], np.where(np.isnan(depth), np.nanmin(depth), depth))
+    assert_array_equal(channels["Y"], np.where(np.isnan(depth), np.nanmin(depth), depth))
     assert (out / "depth.png").is_file()
 
 
-@pytest.mark.parametrize("command", ["infer sphere --method ls", "integrate missing.npy"])
+@parametrize("command", ["infer sphere --method ls", "integrate missing.npy"])
 def test_without_the_library_nothing_is_done(capture, run, monkeypatch, command):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     words = "EXR files need the package OpenEXR, which is not installed"
-    run(f"{command} --format exr", code=2, says=words)
+    run(f"{command} --format exr", usage_error=words)
     assert not Path("out/sphere").exists()

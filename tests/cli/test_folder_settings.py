@@ -5,14 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenes import codes
+from scenes import codes, parametrize, put
 
 
 @pytest.fixture
 def unusual(capture):
     """A capture whose lights have another name and another frame."""
-    lights = np.loadtxt(capture / "light_directions.txt")
-    np.savetxt(capture / "lamps.dat", lights * (1, -1, 1))
+    np.savetxt(capture / "lamps.dat", np.loadtxt(capture / "light_directions.txt") * (1, -1, 1))
     (capture / "light_directions.txt").unlink()
     return capture
 
@@ -35,7 +34,7 @@ def test_written_settings_are_read(unusual, run, document):
     assert other["light_directions"] != expected["light_directions"]
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("text", "says"),
     [
         ("transfer = ", "is not valid TOML"),
@@ -47,16 +46,16 @@ def test_written_settings_are_read(unusual, run, document):
     ],
 )
 def test_wrong_settings(capture, run, text, says):
-    (capture / "splinecli.toml").write_text(text)
+    put(capture / "splinecli.toml", text)
     for command in ("infer", "info"):
-        run(f"{command} {capture}", code=3, says=("splinecli.toml", *np.atleast_1d(says)))
+        run(f"{command} {capture}", input_error=("splinecli.toml", *np.atleast_1d(says)))
     assert not Path("out").exists()
 
 
 def test_settings_that_cannot_be_written(unusual, run):
-    run(f"info {unusual} --lights lamps.txt --write-settings", code=2, says="outside")
+    run(f"info {unusual} --lights lamps.txt --write-settings", usage_error="outside")
     Path("unusual").mkdir()
     given = f"--lights {unusual}/lamps.dat"
-    run(f"info {unusual} --write-settings", code=2, says="needs options")
+    run(f"info {unusual} --write-settings", usage_error="needs options")
     assert not (unusual / "splinecli.toml").exists()
     run(f"info {unusual} {given} --light-frame y-down --write-settings")

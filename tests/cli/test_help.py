@@ -6,13 +6,13 @@ import re
 import shlex
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import typer
 
 from make_pages import FILES, man_pages
+from scenes import parametrize, run_python
 from splinecli.cli.help import EXAMPLES
 from splinecli.cli.main import app
 from splinecli.estimate.methods import method_names
@@ -35,12 +35,12 @@ COMMANDS = (
 )
 
 
-@pytest.mark.parametrize("command", ["", *COMMANDS])
+@parametrize("command", ["", *COMMANDS])
 def test_help_text(command, run, golden):
     golden(f"help{'_' * bool(command)}{command}.txt", run(f"{command} --help", err="").out)
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@parametrize("command", COMMANDS)
 def test_help_fits_a_narrow_terminal(command, run, monkeypatch):
     """Descriptions have more than half of the width, so that the help is a few screens long."""
     monkeypatch.setenv("COLUMNS", "80")
@@ -72,7 +72,7 @@ def test_man_page_names_what_infer_writes():
     assert [name for name in (*own_files(), INDEX) if name not in named] == []
 
 
-@pytest.mark.parametrize("example", EXAMPLES)
+@parametrize("example", EXAMPLES)
 def test_examples_of_the_man_pages_are_valid(example, run):
     _, command, *args = shlex.split(example)
     typer.main.get_command(app).commands[command].make_context(command, list(args))  # type: ignore[attr-defined]
@@ -93,9 +93,7 @@ def test_help_and_ls_do_not_import_torch(capture):
         " file=sys.stderr)"
     )
     commands = ["--help", "infer --help", "--version", f"infer {capture} --method ls"]
-    call = [sys.executable, "-c", script, *commands]
-    done = subprocess.run(call, capture_output=True, text=True, check=True, cwd=capture.parent)
-    *helps, ended = done.stderr.splitlines()
+    *helps, ended = run_python(script, *commands, check=True).stderr.splitlines()
     assert helps == ["0", "0", "0"]
     assert ended.split()[0] == "0"
     assert "torch" not in ended
@@ -118,8 +116,7 @@ print(json.dumps(answers))
 
 def ask(questions):
     """What `splinecli` prints under each of these sets of environment variables."""
-    arguments = [sys.executable, "-c", SCRIPT, json.dumps(questions)]
-    done = subprocess.run(arguments, capture_output=True, text=True, env=dict(os.environ))
+    done = run_python(SCRIPT, json.dumps(questions), env=dict(os.environ))
     assert (done.returncode, done.stderr) == (0, "")
     return json.loads(done.stdout)
 

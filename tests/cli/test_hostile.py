@@ -16,30 +16,20 @@ import cv2
 import numpy as np
 import pytest
 
+from scenes import parametrize, put, run_python, shell
 from splinecli.cli import main
 from splinecli.cli.signals import GRACE_SECONDS, TOLD, report_interruption
 
 posix = pytest.mark.skipif(os.name == "nt", reason="POSIX files, signals and limits")
 
 
-def shell(script):
-    return subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=60)
-
-
 @posix
 def test_devices_and_pipes_are_refused_at_once(capture, run):
     os.mkfifo("pipe")
-    for option, expected in (
-        ("--lights", "a file"),
-        ("--mask", "a file"),
-        ("--ground-truth", "a file"),
-    ):
+    for option in ("--lights", "--mask", "--ground-truth"):
         for path, kind in (("/dev/zero", "a device"), ("pipe", "a pipe")):
-            run(
-                f"infer {capture} --method ls {option} {path}",
-                code=3,
-                err=f"splinecli: {path}: found {kind}, expected {expected}.\n",
-            )
+            message = f"splinecli: {path}: found {kind}, expected a file.\n"
+            run(f"infer {capture} --method ls {option} {path}", code=3, err=message)
     run(f"infer {capture} --method ls")
     for command, code, expected in (
         ("integrate out/sphere --camera-matrix /dev/zero", 3, "a text file"),
@@ -50,25 +40,22 @@ def test_devices_and_pipes_are_refused_at_once(capture, run):
 
 
 @posix
-@pytest.mark.parametrize(
+@parametrize(
     "name",
-    ["mask.png", "ambient.tif", "light_intensities.txt", "image9.png", "Normal_gt.npy", "rti.lp"],
+    "mask.png ambient.tif light_intensities.txt image9.png Normal_gt.npy rti.lp",
 )
-@pytest.mark.parametrize("kind", ["a pipe", "a broken link"])
+@parametrize("kind", ["a pipe", "a broken link"])
 def test_what_is_no_file_is_not_passed_over(capture, run, name, kind):
-    for other in (
-        "mask.png",
-        "normals_gt.npy",
-        *(["light_directions.txt"] if name == "rti.lp" else []),
-    ):
+    for other in ("mask.png", "normals_gt.npy", "light_directions.txt"):
         (capture / other).unlink()
+    if name != "rti.lp":
+        put(capture / "lights.txt", "0 0 1\n1 0 1\n0 1 1\n1 1 1\n" * 2)
     if kind == "a pipe":
         os.mkfifo(capture / name)
     else:
         (capture / name).symlink_to("nothing")
-    result = run(f"infer {capture} --method ls", code=3)
     problem = "found a pipe, expected a file" if kind == "a pipe" else "the file does not exist"
-    assert result.err == f"splinecli: sphere/{name}: {problem}.\n"
+    run(f"infer {capture} --method ls", code=3, err=f"splinecli: sphere/{name}: {problem}.\n")
 
 
 @posix
@@ -97,29 +84,25 @@ def test_a_pipe_that_is_too_long_is_refused_not_cut(capture):
 
 
 def test_a_zero_byte_in_a_list_of_images(capture, run):
-    (capture / "filenames.txt").write_text("image1.png\na\0b.png\n")
-    result = run(f"infer {capture} --method ls", code=3)
-    assert result.err.startswith(
-        'splinecli: sphere/filenames.txt:2: the image "a\\x00b.png" does not exist'
-    )
+    put(capture / "filenames.txt", "image1.png\na\0b.png\n")
+    says = 'splinecli: sphere/filenames.txt:2: the image "a\\x00b.png" does not exist'
+    run(f"infer {capture} --method ls", input_error=says)
 
 
 def test_names_cannot_forge_lines_or_move_the_cursor(make_capture, run, tmp_path):
     forged = "a\nsplinecli: warning: fake"
     for name in (forged, "\x1b[2J\u202eb"):
         make_capture("plain").rename(tmp_path / name)
-        results = []
-        for command, code in (
-            ("infer --method ls", 0),
-            ("infer --method ls", 0),
-            ("infer none --method ls --overwrite", 3),
-            ("info", 0),
-            ("evaluate --method ls --n-lights 4 --trials 1 --overwrite", 0),
-        ):
-            results.append(run(command, name, code=code))
-        results.append(run("infer --method ls", name, "--lights", f"{name}/none\n", code=3))
-        for result in results:
-            text = result.out + result.err
+        results = [
+            run("infer --method ls", name),
+            run("infer --method ls", name),
+            run("infer none --method ls --overwrite", name, code=3),
+            run("info", name),
+            run("evaluate --method ls --n-lights 4 --trials 1 --overwrite", name),
+            run("infer --method ls", name, "--lights", f"{name}/none\n", code=3),
+        ]
+        for _, out, err in results:
+            text = out + err
             assert "\nsplinecli: warning: fake" not in text and not set("\x1b\u202e") & set(text)
     make_capture("plain").rename(tmp_path / "a\nb")
     assert run("infer --method ls", "a\nb").out.startswith("out/a\\nb: 448 pixels")
@@ -137,23 +120,19 @@ def test_cells_are_no_formulas(make_capture, run):
 def test_a_list_of_images_stays_in_its_folder(capture, make_capture, run):
     elsewhere = make_capture("elsewhere")
     names = [f"../elsewhere/image{number}.png" for number in range(1, 9)]
-    (capture / "filenames.txt").write_text("\n".join(names))
+    put(capture / "filenames.txt", "\n".join(names))
     message = (
         "splinecli: sphere/filenames.txt:1: the image"
         ' "../elsewhere/image1.png" is outside the folder of the list.'
     )
     for command in ("infer --method ls", "info", "evaluate --method ls --n-lights 4"):
-        run(f"{command} {capture}", code=3, says=(message, "link to it from there"))
-    (capture / "filenames.txt").write_text(
-        "\n".join(str((elsewhere / n).absolute()) for n in names)
-    )
-    run(f"info {capture}", code=3, says="is outside the folder of the list")
+        run(f"{command} {capture}", input_error=(message, "link to it from there"))
+    put(capture / "filenames.txt", "\n".join(str((elsewhere / n).absolute()) for n in names))
+    run(f"info {capture}", input_error="is outside the folder of the list")
     # It may name links to images elsewhere.
     for number in range(1, 9):
         (capture / f"photo{number}.png").symlink_to(elsewhere.absolute() / f"image{number}.png")
-    (capture / "filenames.txt").write_text(
-        "".join(f"photo{number}.png\n" for number in range(1, 9))
-    )
+    put(capture / "filenames.txt", "".join(f"photo{number}.png\n" for number in range(1, 9)))
     run(f"info {capture}")
 
 
@@ -172,12 +151,8 @@ def test_memory_that_runs_out_is_one_line(capture, make_capture, run, monkeypatc
     make_capture("second")
     decoded = chain([MemoryError()], repeat(DEFAULT))  # the first time only
     monkeypatch.setattr(cv2, "imdecode", Mock(wraps=cv2.imdecode, side_effect=decoded))
-    result = run(f"infer {capture} second --method ls -q", code=1)
-    message = (
-        "splinecli: sphere: there is not enough memory. Close other programs, or use smaller"
-        " images.\n"
-    )
-    assert result.err == message
+    message = "splinecli: sphere: there is not enough memory. Close other programs, or use smaller"
+    run(f"infer {capture} second --method ls -q", code=1, err=f"{message} images.\n")
     assert Path("out/second/normals.png").exists()
 
 
@@ -187,7 +162,7 @@ def test_the_end_of_a_file_is_no_interruption(capture, run, monkeypatch):
 
 
 @posix
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_while_the_program_starts(capture, number):
     """It comes when the first module of the command line is imported,
     before PyTorch and the rest.
@@ -199,7 +174,7 @@ def test_a_signal_while_the_program_starts(capture, number):
         f" {int(number)})\nsys.meta_path.insert(0, Finder())\nfrom splinecli.__main__ import"
         f" run\nsys.argv = ['splinecli', 'infer', {str(capture)!r}]\nrun()"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    done = run_python(script)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "splinecli: interrupted.\n")
 
 
@@ -226,7 +201,7 @@ SWALLOWED = (
 
 
 @posix
-@pytest.mark.parametrize(
+@parametrize(
     ("number", "code"),
     [
         (signal.SIGTERM, "print('ready', flush=True); time.sleep(60)"),
@@ -312,17 +287,12 @@ __main__.run()
 
 
 @posix
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+@parametrize("name", "SIGINT SIGTERM")
 def test_a_library_that_swallows_interrupts_while_it_is_imported(tmp_path, name):
-    (tmp_path / "library.py").write_text(LIBRARY.format(signal=name))
-    done = subprocess.run(
-        [sys.executable, "-c", IMPORTING], cwd=tmp_path, capture_output=True, text=True, timeout=60
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (
-        130,
-        "imported\n",
-        "splinecli: interrupted.\n",
-    )
+    put(tmp_path / "library.py", LIBRARY.format(signal=name))
+    done = run_python(IMPORTING, cwd=tmp_path)
+    interrupted = 130, "imported\n", "splinecli: interrupted.\n"
+    assert (done.returncode, done.stdout, done.stderr) == interrupted
 
 
 def test_libraries_print_nothing(tmp_path):
@@ -337,9 +307,7 @@ def noisy():
 sys.argv = ["splinecli", "noisy"]
 __main__.run()
 """
-    done = subprocess.run(
-        [sys.executable, "-c", command], capture_output=True, text=True, timeout=60
-    )
+    done = run_python(command)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 

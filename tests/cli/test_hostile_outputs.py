@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
-from scenes import to_uint16
+from cli.test_calibrate import LIGHTS, write_balls
+from scenes import parametrize, put
 from splinecli.evaluation.trials import TrialStore
 from system.test_publishing import LINKS
 
@@ -79,16 +80,11 @@ def inputs(capture, monkeypatch):
     for number in (6, 7, 8):
         (capture / f"image{number}.png").unlink()
     lights = capture / "light_directions.txt"
-    lights.write_text("".join(lights.read_text().splitlines(keepends=True)[:5]))
+    put(lights, "".join(lights.read_text().splitlines(keepends=True)[:5]))
     drawn = cv2.imencode(".png", np.zeros((3, 4, 3), np.uint8))[1].tobytes()
     monkeypatch.setattr("splinecli.evaluation.figures.method_maps", lambda *_, **__: drawn)
     np.save("n.npy", np.tile(np.float32([0, 0, 1]), (8, 9, 1)))
-    Path("ball").mkdir()
-    y, x = np.indices((100, 120))
-    for number in range(3):
-        spot = np.exp(-((x - 50 - 10 * number) ** 2 + (y - 48) ** 2) / 20)
-        picture = np.where(np.hypot(x - 60, y - 48) < 40, 0.02 + 0.9 * spot, 0.2)
-        cv2.imwrite(f"ball/{number}.png", to_uint16(picture * 65535))
+    write_balls("ball", LIGHTS[:3])
     return capture
 
 
@@ -105,8 +101,8 @@ def everything_but(folder):
     return state
 
 
-@pytest.mark.parametrize("plant", PLANTS)
-@pytest.mark.parametrize("name", COMMANDS)
+@parametrize("plant", PLANTS)
+@parametrize("name", COMMANDS)
 def test_nothing_outside_of_the_folder_changes(inputs, run, name, plant):
     command, given, names = COMMANDS[name]
     again = f"{command} {'--update' if name == 'prepare' else '--overwrite'}"
@@ -116,7 +112,7 @@ def test_nothing_outside_of_the_folder_changes(inputs, run, name, plant):
     shutil.copytree(folder, "whole")
     # `prepare` writes an entry again only if the capture has changed.
     lights = inputs / "light_directions.txt"
-    lights.write_text(lights.read_text() + "\n")
+    put(lights, lights.read_text() + "\n")
     for taken in names.split():
         shutil.rmtree(folder)
         shutil.copytree(keep or "whole", folder)
@@ -134,8 +130,7 @@ def test_nothing_outside_of_the_folder_changes(inputs, run, name, plant):
         PLANTS[plant](place, target)
         before = everything_but(folder)
         for call in (command, again):
-            result = run(call, code=(0, 3, 5))
-            assert "Traceback" not in result.err
+            assert "Traceback" not in run(call, code=(0, 3, 5)).err
             assert everything_but(folder) == before, (taken, call)
 
 
@@ -146,7 +141,7 @@ def test_trials_go_on_in_a_file_of_their_own(tmp_path):
         + "\n"
     )
     elsewhere, path = tmp_path / "elsewhere", tmp_path / "trials.jsonl"
-    elsewhere.write_text(line + line[:20])
+    put(elsewhere, line + line[:20])
     path.hardlink_to(elsewhere)
     TrialStore(path)
     assert (path.read_text(), path.samefile(elsewhere)) == (line, False)

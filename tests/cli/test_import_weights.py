@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
 
 from estimate.networks.test_official import AuthorsLINet, AuthorsNENet
+from scenes import names_in, put, write_image
 
 
 @pytest.fixture(scope="module")
@@ -32,13 +32,14 @@ def test_imported_weights_run(run, document, make_capture):
         out="new/official.safetensors\n",
         err="",
     )
-    assert [path.name for path in Path("new").iterdir()] == ["official.safetensors"]
+    assert names_in("new") == {"official.safetensors"}
     few = np.zeros((24, 24), np.uint8)
     few[10:14, 10:14] = 255
-    cv2.imwrite("few.png", few)
+    write_image("few.png", few)
     weights = "--weights new/official.safetensors"
     report = document(f"infer {make_capture('sphere')} --mask few.png {weights}")
-    assert (report["weights"]["name"], report["n_pixels"]) == ("official", 16)
+    assert report["weights"]["name"] == "official"
+    assert report["n_pixels"] == 16
     run(
         "import-weights 9-G.ckpt 9-D.ckpt -o new/official.safetensors --overwrite -q",
         out="",
@@ -47,7 +48,7 @@ def test_imported_weights_run(run, document, make_capture):
 
 
 def test_refusals(refuse):
-    Path("notes.txt").write_text("no weights\n")
+    put("notes.txt", "no weights\n")
     Path("there.safetensors").touch()
     cases = """
         4 9-D.ckpt 9-G.ckpt -o new.safetensors

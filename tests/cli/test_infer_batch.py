@@ -14,7 +14,8 @@ from urllib.parse import unquote
 import pytest
 
 from capture.test_cyclesps import write_object
-from cli.conftest import read_report, table
+from cli.conftest import read_report
+from scenes import names_in, parametrize, put, read_json, refuses
 from splinecli.errors import InputError, UsageError
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.pipeline.batch import infer_batch, list_captures, worst_exit_code
@@ -31,10 +32,10 @@ def test_a_batch_goes_on_past_a_bad_capture(capture, make_capture, run, golden):
     result = run(f"infer {capture} broken third --method ls", code=3)
     golden("batch.out.txt", result.out)
     golden("batch.err.txt", re.sub(r"[0-9]+\.[0-9]$", "SECONDS", result.err, flags=re.MULTILINE))
-    assert sorted(path.name for path in Path("out").iterdir()) == ["index.html", "sphere", "third"]
+    assert names_in("out") == {"index.html", "sphere", "third"}
 
     documents = run(f"infer {capture} broken --method ls --json --overwrite", code=3).json
-    assert documents[0] == read_report(Path("out/sphere"))
+    assert documents[0] == read_report()
     assert documents[1]["capture"] == "broken"
     assert "image3.png" in documents[1]["error"]
 
@@ -45,7 +46,7 @@ def test_links_are_called_by_their_own_names(capture, run):
         Path(link).symlink_to(capture.absolute())
     run("infer x/obj y/obj --method ls", code=2)
     run("infer one two --method ls")
-    assert sorted(path.name for path in Path("out").iterdir()) == ["index.html", "one", "two"]
+    assert names_in("out") == {"index.html", "one", "two"}
 
 
 def test_two_kinds_of_images_of_a_cyclesps_object(capture, run):
@@ -53,18 +54,11 @@ def test_two_kinds_of_images_of_a_cyclesps_object(capture, run):
     write_object(holder, "specular", "metallic")
     result = run(f"infer {holder / 'images_specular'} Ball/images_metallic --method ls")
     assert result.err.endswith("2 captures: 2 done; see out/index.html\n")
-    assert {path.name for path in Path("out").iterdir()} == {
-        "index.html",
-        "Ball_specular",
-        "Ball_metallic",
-    }
-    assert read_report(Path("out/Ball_metallic"))["capture"] == "Ball_metallic"
+    assert names_in("out") == {"index.html", "Ball_specular", "Ball_metallic"}
+    assert read_report("Ball_metallic")["capture"] == "Ball_metallic"
     # An object with several kinds is passed over among others, under its own name.
-    result = run(
-        f"infer {holder} {capture} --method ls --overwrite",
-        code=3,
-        says="Ball: found 2 folders of images (images_metallic, images_specular)",
-    )
+    says = "Ball: found 2 folders of images (images_metallic, images_specular)"
+    run(f"infer {holder} {capture} --method ls --overwrite", input_error=says)
 
 
 def test_an_index_of_several_captures(capture, make_capture, run):
@@ -72,7 +66,7 @@ def test_an_index_of_several_captures(capture, make_capture, run):
     make_capture("broken")
     Path("broken/image3.png").write_bytes(b"no picture")
     Path("out").mkdir()
-    Path("out/index.html").write_text("<html>my site</html>", "utf-8")
+    put("out/index.html", "<html>my site</html>")
     captures = ("infer sphere broken --method ls --html", "a b")
     run(*captures, code=5, says="index.html: the file was not written by splinecli")
     Path("out/index.html").unlink()
@@ -108,7 +102,8 @@ def test_a_folder_that_is_given_twice_counts_once(capture, run):
         f"infer {capture} {capture.absolute()} others/../sphere sphere/ --method ls --json"
     )
     (document,) = result.json
-    assert (result.err, document["capture"]) == ("", "sphere")
+    assert result.err == ""
+    assert document["capture"] == "sphere"
     assert not Path("out/index.html").exists()
 
 
@@ -132,22 +127,18 @@ REFUSED_ARGUMENTS = """
 """
 
 
-@pytest.mark.parametrize("arguments, code, message", table(REFUSED_ARGUMENTS))
+@parametrize("arguments, code, message", REFUSED_ARGUMENTS)
 def test_arguments_are_checked_before_the_first_capture(
     arguments, code, message, capture, make_capture, run, monkeypatch
 ):
     if "--cluster" in arguments:
-        pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+        pytest.importorskip("distributed")
     make_capture("second")
-    touched = []
-    monkeypatch.setattr(
-        "splinecli.pipeline.batch.infer_capture", lambda *_, **__: touched.append(1)
-    )
-    call = f"infer {capture} second --method ls {arguments}"
-    code = int(code)
-    result = run(call, code=code, says=message)
-    assert (result.out, touched, result.err.count("\n")) == ("", [], 1)
-    assert not Path("out").exists()
+    infer = Mock()
+    monkeypatch.setattr("splinecli.pipeline.batch.infer_capture", infer)
+    call, code = f"infer {capture} second --method ls {arguments}", int(code)
+    assert run(call, code=code, says=message, out="").err.count("\n") == 1
+    assert not infer.called and not Path("out").exists()
     documents = run(f"{call} --json", code=code).json
     assert [document["exit_code"] for document in documents] == [code]
     assert message in documents[0]["error"]
@@ -157,91 +148,70 @@ def test_options_are_written_and_read_back(capture, run):
     """They are the report's `options`, go through JSON and pickle, and tell what changes the
     results.
     """
-    options = InferOptions(
-        method="ls",
-        n_lights=5,
-        seed=3,
-        formats=("npy",),
-        maps=("albedo",),
-        white_level=60_000.5,
-        output="elsewhere",
-    )
-    assert InferOptions.from_dict(json.loads(json.dumps(options.as_dict()))) == options
+    given = {"n_lights": 5, "seed": 3, "formats": ("npy",), "maps": ("albedo",)}
+    options = InferOptions(method="ls", white_level=60_000.5, output="elsewhere", **given)
+    values = options.as_dict()
+    assert InferOptions.from_dict(json.loads(json.dumps(values))) == options
     assert pickle.loads(pickle.dumps(options)) == options
-    assert infer_capture(capture, options)["options"] == options.as_dict()
-    assert read_report(Path("elsewhere/sphere"))["options"] == options.as_dict()
-    assert (
-        options.changes(
-            InferOptions.from_dict({**options.as_dict(), "output": "x", "device": "cpu"})
-        )
-        == []
-    )
-    assert options.changes(InferOptions.from_dict({**options.as_dict(), "seed": 4})) == ["--seed"]
-    contradictions = {"mask": "m.png", "auto_mask": True}, {"align": True, "scale": "1/2"}
+    assert infer_capture(capture, options)["options"] == values
+    assert read_json("elsewhere/sphere/report.json")["options"] == values
+    for changed, expected in (({"output": "x", "device": "cpu"}, []), ({"seed": 4}, ["--seed"])):
+        assert options.changes(InferOptions.from_dict({**values, **changed})) == expected
     for wrong in (
         {"formats": ("bmp",)},
         {"maps": ("depth",)},
         {"convention": "up"},
-        *contradictions,
+        {"mask": "m.png", "auto_mask": True},
+        {"align": True, "scale": "1/2"},
     ):
         with pytest.raises(UsageError):
             InferOptions(**wrong)
 
 
+class Watcher(Observer):
+    """Keeps the steps of each bar, and calls a function at each with all notes of its bar."""
+
+    def __init__(self, at_each=lambda notes: None):
+        self.bars, self.at_each = {}, at_each
+
+    @contextmanager
+    def progress(self, label, total, *, start=0.0, unit=""):
+        steps = self.bars.setdefault(label, [])
+
+        def advance(amount, note=""):
+            steps.append((amount, note))
+            self.at_each([note for _, note in steps])
+
+        yield advance
+
+
 def test_the_pipeline_reports_to_an_observer(capture, make_capture):
     make_capture("second")
     (capture / "mask.png").unlink()
-
-    class Recorder(Observer):
-        def __init__(self):
-            self.bars = {}
-
-        @contextmanager
-        def progress(self, label, total, *, start=0.0, unit=""):
-            steps = self.bars.setdefault(label, [])
-            yield lambda amount, note="": steps.append((amount, note))
-
-    recorder = Recorder()
-    outcomes = list(infer_batch([capture, Path("second")], InferOptions(method="ls"), recorder))
-    assert [(one.report["capture"], one.status) for one in outcomes] == [
-        ("sphere", "done"),
-        ("second", "done"),
-    ]
-    assert list(recorder.bars) == ["sphere", "second"]
-    for steps in recorder.bars.values():
+    watcher = Watcher()
+    outcomes = list(infer_batch([capture, Path("second")], InferOptions(method="ls"), watcher))
+    found = [(one.report["capture"], one.status) for one in outcomes]
+    assert found == [("sphere", "done"), ("second", "done")]
+    assert list(watcher.bars) == ["sphere", "second"]
+    for steps in watcher.bars.values():
         amounts, notes = zip(*steps, strict=True)
-        assert list(dict.fromkeys(notes)) == [
-            "reading",
-            "checking",
-            "estimating",
-            "maps",
-            "writing",
-        ]
+        assert " ".join(dict.fromkeys(notes)) == "reading checking estimating maps writing"
         assert min(amounts) >= 0 and 0.5 < sum(amounts) <= 1 + 1e-9
 
 
-@pytest.mark.parametrize("stage", ["reading", "estimating"])
-@pytest.mark.parametrize("name", ["light_directions.txt", "image3.png"])
+@parametrize("stage", "reading estimating")
+@parametrize("name", "light_directions.txt image3.png")
 def test_a_file_that_changes_during_the_run_is_read_anew_in_the_next(capture, stage, name):
     """The report states the files that were used, not those that lie there at the end."""
 
-    class Meddler(Observer):
-        @contextmanager
-        def progress(self, label, total, *, start=0.0, unit=""):
-            notes = []
-
-            def advance(amount, note=""):
-                if note == stage not in notes:
-                    (capture / name).write_bytes((capture / name).read_bytes() + b"\n")
-                notes.append(note)
-
-            yield advance
+    def meddle(notes):
+        if notes[-1] == stage and notes.count(stage) == 1:
+            (capture / name).write_bytes((capture / name).read_bytes() + b"\n")
 
     options, statuses = InferOptions(method="ls"), []
-    for observer in (Meddler(), Observer(), Observer()):
-        statuses += [
-            outcome.status for outcome in infer_batch([capture], options, observer, redo="changed")
-        ]
+    for observer in (Watcher(meddle), Observer(), Observer()):
+        (outcome,) = infer_batch([capture], options, observer, redo="changed")
+        statuses.append(outcome.status)
     assert statuses == ["done", "done", "skipped"]
 
 
@@ -254,10 +224,8 @@ def test_shards_give_the_results_of_the_whole(capture, make_capture, run):
     for name in names:
         parts = [Path(place, name, "normals.npy").read_bytes() for place in ("out", "whole")]
         assert parts[0] == parts[1]
-    links = re.findall(r'href="([^"]+normals.npy)"', Path("out/index.html").read_text("utf-8"))
-    assert sorted(unquote(link) for link in links) == sorted(
-        f"{name}/normals.npy" for name in names
-    )
+    links = re.findall(r'href="([^"]+)/normals.npy"', Path("out/index.html").read_text("utf-8"))
+    assert sorted(map(unquote, links)) == sorted(names)
 
 
 def test_json_lines(capture, make_capture, run):
@@ -272,16 +240,14 @@ def test_json_lines(capture, make_capture, run):
         assert (document["capture"], document["exit_code"]) == (None, 2)
 
 
-@pytest.mark.parametrize("codes, worst", [([], 0), ([0, 3, 0], 3), ([5, 3, 2], 5), ([5, 1, 3], 1)])
+@parametrize("codes, worst", [([], 0), ([0, 3, 0], 3), ([5, 3, 2], 5), ([5, 1, 3], 1)])
 def test_the_worst_exit_code(codes, worst):
     assert worst_exit_code(codes) == worst
 
 
+DENIED = PermissionError(errno.EACCES, "Permission denied", "sphere/image1.png")
 FAILURES = {
-    "unreadable image": (
-        PermissionError(errno.EACCES, "Permission denied", "sphere/image1.png"),
-        3,
-    ),
+    "unreadable image": (DENIED, 3),
     "bad input": (InputError("the image is damaged"), 3),
     "usage": (UsageError("too few lights"), 2),
     "defect": (RuntimeError("oops"), 1),
@@ -289,7 +255,7 @@ FAILURES = {
 }
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "place", [(InferOptions, "open"), (LeastSquares, "estimate")], ids=["open", "estimate"]
 )
 def test_a_failure_is_that_of_its_capture(place, make_capture, run, monkeypatch):
@@ -307,13 +273,11 @@ def test_a_failure_is_that_of_its_capture(place, make_capture, run, monkeypatch)
     *failed, good = result.json
     expected = [(name, code) for name, (_, code) in FAILURES.items()]
     assert [(one["capture"], one["exit_code"]) for one in failed] == expected
-    assert good == read_report(Path("out/good"))
+    assert good == read_report("good")
     assert failed[0]["error"] == "sphere/image1.png: cannot be read (Permission denied)."
     assert all(f"splinecli: {one['error']}\n" in result.err for one in failed)
     assert result.err.count("Traceback") == 1
-    assert (
-        "defect: RuntimeError: oops. This is a defect of splinecli. Please report it" in result.err
-    )
+    assert "RuntimeError: oops. This is a defect of splinecli. Please report it" in result.err
 
 
 def test_files_without_permission(make_capture, run_without_privileges):
@@ -327,29 +291,25 @@ def test_files_without_permission(make_capture, run_without_privileges):
     assert (first["exit_code"], second["exit_code"]) == (3, 3)
     assert first["error"] == "closed: the folder cannot be read (Permission denied)."
     assert "image/image1.png" in second["error"]
-    assert third == read_report(Path("out/good"))
+    assert third == read_report("good")
 
 
 def test_what_is_no_folder_is_the_failure_of_its_capture(capture, run):
     """A pattern such as captures/* may match files too; they do not stop the captures."""
-    Path("notes.txt").write_text("mine")
+    put("notes.txt", "mine")
     result = run(f"infer nowhere notes.txt {capture} --method ls --json", code=3)
     first, second, third = result.json
     missing = {"capture": "nowhere", "error": "nowhere: the folder does not exist.", "exit_code": 3}
     assert first == missing
     assert "notes.txt: found a file, expected a folder" in second["error"]
-    assert third == read_report(Path("out/sphere"))
+    assert third == read_report()
     # Earlier results of other options do not hide it.
     capture.rename("moved")
-    gone = run(
-        "infer sphere moved --method ls --n-lights 4",
-        code=3,
-        says="sphere: the folder does not exist",
-    )
-    assert gone.err.endswith("2 captures: 1 done, 1 missing; see out/index.html\n")
+    says = ("sphere: the folder does not exist", "2 captures: 1 done, 1 missing; see out/index")
+    run("infer sphere moved --method ls --n-lights 4", input_error=says)
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@parametrize("workers", [1, 2])
 def test_folders_that_cannot_be_written_do_not_end_a_batch(
     make_capture, run_without_privileges, workers
 ):
@@ -357,21 +317,18 @@ def test_folders_that_cannot_be_written_do_not_end_a_batch(
     for name in names:
         make_capture(name)
     Path("out/closed").mkdir(parents=True, mode=0o555)
-    Path("out/file").write_text("mine")
-    result = run_without_privileges(
-        f"infer --method ls --jsonl --workers {workers}", *names, code=5
-    )
-    found = {document["capture"]: document for document in map(json.loads, result.out.splitlines())}
+    put("out/file", "mine")
+    call = f"infer --method ls --jsonl --workers {workers}"
+    lines = run_without_privileges(call, *names, code=5).out.splitlines()
+    found = {document["capture"]: document for document in map(json.loads, lines)}
     assert (found["closed"]["exit_code"], found["file"]["exit_code"]) == (5, 5)
     assert found["closed"]["error"].startswith(
         "out/closed: no permission to write into this folder"
     )
-    assert found["good"] == read_report(Path("out/good"))
+    assert found["good"] == read_report("good")
 
 
-@pytest.mark.parametrize(
-    "error", [NoRoomError("full"), OSError(errno.ENOSPC, "No space left on device")]
-)
+@parametrize("error", [NoRoomError("full"), OSError(errno.ENOSPC, "No space left on device")])
 def test_a_full_disk_ends_a_batch(error, capture, make_capture, run, monkeypatch):
     monkeypatch.setattr("splinecli.results.files.write_estimate", Mock(side_effect=error))
     result = run(f"infer {capture} {make_capture('second')} --method ls --json", code=5)
@@ -381,12 +338,11 @@ def test_a_full_disk_ends_a_batch(error, capture, make_capture, run, monkeypatch
 
 
 def test_images_in_place_of_their_folder(run, capture):
-    result = run("infer --method ls", *sorted(capture.glob("image*.png")), code=2)
-    expected = "splinecli: 8 images were given, expected their folder. Pass the folder 'sphere'.\n"
-    assert result.err == expected
+    message = "splinecli: 8 images were given, expected their folder. Pass the folder 'sphere'.\n"
+    run("infer --method ls", *sorted(capture.glob("image*.png")), code=2, err=message)
 
 
-@pytest.mark.parametrize("count, captures", [(1, 5), (3, 0), (7, 23), (40, 23)])
+@parametrize("count, captures", [(1, 5), (3, 0), (7, 23), (40, 23)])
 def test_the_union_of_the_shards_is_the_whole(count, captures, tmp_path):
     """Each shard sees the folders in an order of its own, as shells of different languages give
     it.
@@ -403,11 +359,11 @@ def test_the_union_of_the_shards_is_the_whole(count, captures, tmp_path):
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "text", ["", "1", "0/3", "4/3", "1/0", "-1/3", "a/b", "1/3/5", "1.0/3", "9" * 30 + "/1"]
 )
 def test_other_shards_are_refused(text):
-    with pytest.raises(UsageError, match="--shard is"):
+    with refuses("--shard is", UsageError):
         Shard.parse(text)
 
 
@@ -415,5 +371,5 @@ def test_captures_of_one_name_in_different_shards(tmp_path):
     folders = [tmp_path / place / "same" for place in "ab"]
     for folder in folders:
         folder.mkdir(parents=True)
-    with pytest.raises(UsageError, match="have the same name"):
+    with refuses("have the same name", UsageError):
         list_captures([*folders, Path("none")], Shard(1, 3))

@@ -6,14 +6,27 @@ from pathlib import Path
 from xml.etree import ElementTree
 from zipfile import ZipFile
 
-import cv2
 import numpy as np
 import pytest
 import tifffile
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
+from pytest import approx
 
-from scenes import BUMP_LAMPS, read_image, read_json, write_bump
+from cli.conftest import read_report
+from scenes import (
+    BUMP_LAMPS,
+    ball,
+    names_in,
+    parametrize,
+    put,
+    read_image,
+    read_json,
+    table,
+    tilted,
+    write_bump,
+    write_image,
+)
 from splinecli.capture.formats import images
 from splinecli.maths.normals import encode_picture
 from splinecli.pipeline.infer import results_bytes
@@ -24,21 +37,19 @@ CORE_3MF = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
 
 def sphere():
     """Return normals, heights and mask of a spherical cap of radius 30 about (24.5, 19.5)."""
-    y, x = np.indices(SHAPE).astype(float)
-    nx, ny = (x - 24.5) / 30, (19.5 - y) / 30
-    inside = np.hypot(nx, ny) < 0.6
-    nz = np.sqrt(np.where(inside, 1 - nx**2 - ny**2, 1))
-    normals = np.where(inside[..., None], np.stack((nx, ny, nz), axis=-1), 0)
-    heights = np.where(inside, 30 * nz, np.nan)
-    return normals.astype(np.float32), heights - np.nanmean(heights), inside
+    normals, _ = ball(SHAPE, 24.5, 19.5, 30)
+    inside = normals[..., 2] > 0.8
+    normals[~inside] = 0
+    heights = np.where(inside, 30 * normals[..., 2], np.nan)
+    return np.float32(normals), heights - np.nanmean(heights), inside
 
 
 @pytest.fixture(autouse=True)
 def here():
     normals, _, inside = sphere()
     np.save("normals.npy", normals)
-    cv2.imwrite("normals.png", encode_picture(normals, inside)[..., ::-1])
-    cv2.imwrite("directx.png", encode_picture(normals, inside, convention="directx")[..., ::-1])
+    write_image("normals.png", encode_picture(normals, inside)[..., ::-1])
+    write_image("directx.png", encode_picture(normals, inside, convention="directx")[..., ::-1])
 
 
 def check_heights(depth):
@@ -50,20 +61,15 @@ def check_heights(depth):
 def test_heights_and_mesh_of_a_sphere(run):
     result = run("integrate normals.npy -o out --format ply,obj,npy,tiff", err="")
     inside, depth = sphere()[2], np.load("out/depth.npy")
-    assert (depth.dtype, depth.shape) == (np.float32, SHAPE)
+    assert depth.dtype == np.float32
+    assert depth.shape == SHAPE
     check_heights(depth)
     assert_array_equal(tifffile.imread("out/depth.tiff"), depth)
     report = read_json("out/surface.json")
     assert report["n_pixels"] == inside.sum()
-    assert report["files"] == [
-        "mesh.ply",
-        "mesh.obj",
-        "mesh.mtl",
-        "depth.npy",
-        "depth.tiff",
-        "surface.json",
-    ]
-    assert sorted(path.name for path in Path("out").iterdir()) == sorted(report["files"])
+    files = "mesh.ply mesh.obj mesh.mtl depth.npy depth.tiff surface.json"
+    assert " ".join(report["files"]) == files
+    assert names_in("out") == set(report["files"])
     assert f"out: {inside.sum()} pixels, from " in result.out
 
 
@@ -72,8 +78,8 @@ def test_a_picture_of_the_other_convention(run):
     check_heights(np.load("out/depth.npy"))
 
 
-@pytest.mark.parametrize("given", ["", "--convention directx"], ids=["found", "given"])
-@pytest.mark.parametrize("form", ["png", "png8", "npy", "tiff"])
+@parametrize("given", ["", "--convention directx"], ids=["found", "given"])
+@parametrize("form", "png png8 npy tiff")
 def test_the_convention_of_a_folder_is_recognised(run, capture, form, given):
     """The values of .npy and .tiff have y up, whatever the green of the pictures means."""
     depths = []
@@ -86,23 +92,22 @@ def test_the_convention_of_a_folder_is_recognised(run, capture, form, given):
     assert np.nanmax(depths[0]) - np.nanmin(depths[0]) > 1
 
 
-def test_an_array_of_something_else(run):
-    np.save("albedo.npy", np.random.default_rng(0).uniform(0, 0.4, (*SHAPE, 3)).astype(np.float32))
-    run("integrate albedo.npy -o out", code=3, says="this is not a normal map")
+def test_an_array_of_something_else(run, rng):
+    np.save("albedo.npy", np.float32(rng.uniform(0, 0.4, (*SHAPE, 3))))
+    run("integrate albedo.npy -o out", input_error="this is not a normal map")
 
 
-@pytest.mark.parametrize("where", ["mask", "alpha"])
+@parametrize("where", "mask alpha")
 def test_a_background_that_is_not_black(run, where):
     normals, _, inside = sphere()
-    picture = np.where(inside[..., None], encode_picture(normals, inside), 65_535).astype(
-        np.uint16
-    )[..., ::-1]
-    cut = inside.astype(np.uint16) * 65_535
-    cv2.imwrite("white.png", np.dstack([picture, cut]) if where == "alpha" else picture)
-    cv2.imwrite("mask.png", cut)
+    picture = encode_picture(normals, inside)[..., ::-1]
+    picture[~inside] = 65_535
+    cut = np.uint16(inside) * 65_535
+    write_image("white.png", np.dstack([picture, cut]) if where == "alpha" else picture)
+    write_image("mask.png", cut)
     arguments = "integrate white.png -o out --format npy"
     if where == "mask":
-        run(arguments, code=3, says="this is not a normal map")
+        run(arguments, input_error="this is not a normal map")
         arguments += " --mask mask.png"
     run(arguments)
     check_heights(np.load("out/depth.npy"))
@@ -114,22 +119,21 @@ def write_depth(form, depth):
     elif form == "tif":
         tifffile.imwrite("prior.tif", depth)
     else:
-        header = {
-            "compression": (exr := pytest.importorskip("OpenEXR")).ZIP_COMPRESSION,
-            "type": exr.scanlineimage,
-        }
+        exr = pytest.importorskip("OpenEXR")
+        header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
         exr.File(header, {"Z": depth}).write("prior.exr")
     return f"prior.{form}"
 
 
-@pytest.mark.parametrize("form", ["npy", "tif", "exr"])
+@parametrize("form", "npy tif exr")
 def test_a_prior(run, form):
     """Its heights in millimetres decide where the surface is."""
     _, heights, inside = sphere()
-    prior = write_depth(form, np.where(inside, 0.5 * (heights + 100), np.nan).astype(np.float32))
+    prior = write_depth(form, np.float32(np.where(inside, 0.5 * (heights + 100), np.nan)))
     arguments = f"normals.png --prior {prior} --pixel-size 0.5 -o out --format npy --json"
     report = run(f"integrate {arguments}").json
-    assert (report["prior"], report["unit"]) == (prior, "millimetre")
+    assert report["prior"] == prior
+    assert report["unit"] == "millimetre"
     assert_allclose(np.load("out/depth.npy")[inside], 0.5 * (heights + 100)[inside], atol=0.2)
 
 
@@ -140,45 +144,38 @@ def with_one(value, every=1):
     return heights
 
 
+FIRST = ", the first in row 9, column 20."
 BAD_PRIORS = {
     "size": (np.ones((3, 4), np.float32), "found a depth map of 4 x 3 pixels"),
     "integers": (np.ones(SHAPE, np.uint16), "expected floating-point numbers"),
     "vectors": (np.ones((*SHAPE, 2), np.float32), "expected floating-point numbers"),
     "nothing": (np.full(SHAPE, np.nan, np.float32), "the prior has no value in the mask"),
     "larger than squares": (sphere()[1] * 1e200, "values of the prior are beyond 1e+07"),
-    "one of 1e60": (
-        with_one(1e60),
-        "values of the prior are beyond 1e+07, the first in row 9, column 20.",
-    ),
-    "one of 1e6": (
-        with_one(1e6),
-        "than 3 times the width of the object, the first in row 9, column 20.",
-    ),
-    "one among few": (
-        with_one(1e6, 97),
-        "than 3 times the width of the object, the first in row 9, column 20.",
-    ),
-    "negated": (-sphere()[1].astype(np.float32), "the prior is -"),
+    "one of 1e60": (with_one(1e60), f"values of the prior are beyond 1e+07{FIRST}"),
+    "one of 1e6": (with_one(1e6), f"than 3 times the width of the object{FIRST}"),
+    "one among few": (with_one(1e6, 97), f"than 3 times the width of the object{FIRST}"),
+    "negated": (-np.float32(sphere()[1]), "the prior is -"),
 }
 
 
-@pytest.mark.parametrize("case", BAD_PRIORS)
+@parametrize("case", BAD_PRIORS)
 def test_a_bad_prior(run, case):
     prior, message = BAD_PRIORS[case]
     np.save("prior.npy", prior)
-    run("integrate normals.png --prior prior.npy -o out", code=3, says=message)
+    run("integrate normals.png --prior prior.npy -o out", input_error=message)
     assert not Path("out/surface.json").exists()
 
 
-@pytest.mark.parametrize("form", ["npy", "tif", "exr"])
+@parametrize("form", "npy tif exr")
 def test_a_damaged_prior(run, form):
     """The libraries print warnings, which belong neither to stdout nor to stderr."""
     prior = Path(write_depth(form, np.ones(SHAPE, np.float32)))
     whole = prior.read_bytes()
     for content in (b"\x93NUMPY\x01\x00garbage", whole[: len(whole) // 2]):
         prior.write_bytes(content)
-        result = run(f"integrate normals.png --prior {prior} -o out", code=3, says=prior.name)
-        assert (result.out, result.err.count("\n")) == ("", 1)
+        result = run(f"integrate normals.png --prior {prior} -o out", input_error=prior.name)
+        assert result.out == ""
+        assert result.err.count("\n") == 1
     run("integrate normals.png --prior-detail 9 -o out", code=2)
 
 
@@ -193,13 +190,13 @@ VIEWS = {
 }
 
 
-@pytest.mark.parametrize("view", VIEWS)
+@parametrize("view", VIEWS)
 def test_a_folder_of_results_gives_the_surface_of_infer(run, capture, view):
     """Camera, pixel size, frame and discontinuity of the results are in their report."""
     import trimesh
 
     np.savetxt("lamps.txt", BUMP_LAMPS)
-    Path("camera.txt").write_text("100 0 15.5\n0 100 15.5\n0 0 1\n")
+    put("camera.txt", "100 0 15.5\n0 100 15.5\n0 0 1\n")
     folder = write_bump(Path("bump")) if "lamps.txt" in VIEWS[view] else capture
     arguments = "--method ls --maps albedo --surface --json"
     [report] = run(f"infer {folder} {VIEWS[view]} {arguments}").json
@@ -216,21 +213,22 @@ def test_a_folder_of_results_gives_the_surface_of_infer(run, capture, view):
         assert_array_equal(one.faces, other.faces)  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("size", ["--pixel-size 2e-9", "--object-width 64e-9"])
+@parametrize("size", ["--pixel-size 2e-9", "--object-width 64e-9"])
 def test_the_unit_of_lamps_is_not_that_of_the_surface(document, size):
     """Lamps in a unit in which pixels are smaller than any in millimetres."""
     np.savetxt("lamps.txt", 1e-9 * BUMP_LAMPS)
     write_bump(Path("bump"))
     document(f"infer bump --method ls --light-positions lamps.txt {size}")
     report = document("integrate out/bump --format npy")
-    assert (report["unit"], report["pixel_size_mm"]) == ("pixel", None)
+    assert report["unit"] == "pixel"
+    assert report["pixel_size_mm"] is None
 
 
 def test_a_part_in_colour_by_perspective(run):
     trimesh = pytest.importorskip("trimesh")
-    cv2.imwrite("half.png", np.tile(np.uint8(255) * (np.arange(SHAPE[1]) < 25), (SHAPE[0], 1)))
-    cv2.imwrite("red.png", np.tile(np.uint8((0, 0, 200)), (*SHAPE, 1)))  # in OpenCV's order
-    Path("camera.txt").write_text("200 0 24.5\n0 200 19.5\n0 0 1\n")
+    write_image("half.png", np.tile(np.uint8(255) * (np.arange(SHAPE[1]) < 25), (SHAPE[0], 1)))
+    write_image("red.png", np.tile(np.uint8((0, 0, 200)), (*SHAPE, 1)))  # in OpenCV's order
+    put("camera.txt", "200 0 24.5\n0 200 19.5\n0 0 1\n")
     options = "--mask half.png --colours red.png --camera-matrix camera.txt"
     report = run(f"integrate normals.npy {options} -o out --json").json
     assert report["camera"] == "perspective"
@@ -241,10 +239,11 @@ def test_a_part_in_colour_by_perspective(run):
     assert (mesh.visual.vertex_colors[:, :3] == (200, 0, 0)).all()
     assert (mesh.vertices[:, 2] < 0).all()  # before the camera, which looks along -z
     # A pixel without a size counts as a millimetre. Columns 7 to 24 are on the object.
-    assert trimesh.load("out/mesh.glb").extents[0] == pytest.approx(0.017, rel=0.05)
+    assert trimesh.load("out/mesh.glb").extents[0] == approx(0.017, rel=0.05)
     sized = run(f"integrate normals.npy {options} -o sized --pixel-size 2 --json").json
-    assert (sized["unit"], sized["pixel_size_mm"]) == ("millimetre", 2)
-    assert sized["range"] == pytest.approx(np.multiply(report["range"], 200 * 2), rel=1e-6)
+    assert sized["unit"] == "millimetre"
+    assert sized["pixel_size_mm"] == 2
+    assert sized["range"] == approx(np.multiply(report["range"], 200 * 2), rel=1e-6)
 
 
 def test_millimetres_in_the_files(run):
@@ -255,14 +254,12 @@ def test_millimetres_in_the_files(run):
     _, heights, inside = sphere()
     columns = np.flatnonzero(inside.any(axis=0))
     width_mm, depth = 0.5 * float(np.ptp(columns)), np.load("out/depth.npy")
-    assert np.nanmax(depth) - np.nanmin(depth) == pytest.approx(
-        0.5 * np.ptp(heights[inside]), rel=0.02
-    )
-    assert report["range"] == pytest.approx([np.nanmin(depth), np.nanmax(depth)], rel=1e-6)
+    assert np.nanmax(depth) - np.nanmin(depth) == approx(0.5 * np.ptp(heights[inside]), rel=0.02)
+    assert report["range"] == approx([np.nanmin(depth), np.nanmax(depth)], rel=1e-6)
     # The outline of the glTF file is smoothed.
     for name, unit_mm, rel in (("ply", 1, 1e-4), ("stl", 1, 1e-4), ("glb", 1000, 0.03)):
-        extents = trimesh.load(Path(f"out/mesh.{name}")).extents * unit_mm
-        assert extents[[0, 2]] == pytest.approx([width_mm, np.ptp(report["range"])], rel=rel), name
+        extents = trimesh.load(f"out/mesh.{name}").extents * unit_mm
+        assert extents[[0, 2]] == approx([width_mm, np.ptp(report["range"])], rel=rel), name
     assert b"\ncomment unit: millimetre\n" in Path("out/mesh.ply").read_bytes()
 
 
@@ -293,12 +290,9 @@ def test_a_solid_in_the_files(run):
     )
     for solid in solids:
         assert solid.is_watertight
-        assert solid.volume == pytest.approx(volume, rel=0.01)
-    run(
-        "integrate normals.npy -o flat --solid 3",
-        code=2,
-        says=("the surface has no scale", "--pixel-size"),
-    )
+        assert solid.volume == approx(volume, rel=0.01)
+    says = "the surface has no scale", "--pixel-size"
+    run("integrate normals.npy -o flat --solid 3", usage_error=says)
 
 
 def test_a_picture_of_the_depth(run):
@@ -306,25 +300,23 @@ def test_a_picture_of_the_depth(run):
     report = run(f"integrate normals.npy -o out {arguments}").json
     picture, depth = read_image("out/depth.png"), np.load("out/depth.npy")
     low, high = report["range"]
-    assert (picture.dtype, report["unit"]) == (np.uint16, "millimetre")
+    assert picture.dtype == np.uint16
+    assert report["unit"] == "millimetre"
     assert_array_equal(picture == 0, np.isnan(depth))
     inside = picture > 0
     read = low + (picture[inside] - 1.0) / 65_534 * (high - low)
     assert_allclose(read, depth[inside], atol=(high - low) / 65_534)
-    assert (picture[inside].min(), picture.max()) == (1, 65_535)
+    assert picture[inside].min() == 1
+    assert picture.max() == 65_535
     with Image.open("out/depth.png") as opened:
         assert f"1 = {low:.7g}, 65535 = {high:.7g}; unit: millimetre" in opened.info["depth"]
 
 
 def test_the_angle_of_a_levelled_surface_is_printed(run):
-    np.save(
-        "tilted.npy",
-        np.full((20, 30, 3), (0.0, np.sin(np.radians(5)), np.cos(np.radians(5))), np.float32),
-    )
-    run(
-        "integrate tilted.npy -o out --level plane",
-        err="The surface was levelled by 5.00 degrees\n",
-    )
+    up = np.full((20, 30), np.tan(np.radians(5)), np.float32)
+    np.save("tilted.npy", tilted(0 * up, up))
+    err = "The surface was levelled by 5.00 degrees\n"
+    run("integrate tilted.npy -o out --level plane", err=err)
 
 
 def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monkeypatch):
@@ -333,52 +325,50 @@ def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monke
     """
     mask = np.zeros((24, 24), np.uint8)
     mask[8:16, 12] = 255  # a line
-    cv2.imwrite("line.png", mask)
-    run(
-        f"infer {capture} --method ls --mask line.png --surface",
-        code=3,
-        says=("sphere: the mesh has no triangles", "or leave --surface out"),
-    )
+    write_image("line.png", mask)
+    says = "sphere: the mesh has no triangles", "or leave --surface out"
+    run(f"infer {capture} --method ls --mask line.png --surface", input_error=says)
     assert not Path("out/sphere/report.json").exists()
 
     run(f"infer {capture} --method ls --overwrite")
-    n_pixels = read_json("out/sphere/report.json")["n_pixels"]
+    n_pixels = read_report()["n_pixels"]
     assert results_bytes(n_pixels, 5, surface=True) - results_bytes(n_pixels, 5) == n_pixels * 600
     monkeypatch.setattr(images, "available_memory", lambda: n_pixels * 600.0)
     run("integrate out/sphere")
     monkeypatch.setattr(images, "available_memory", lambda: n_pixels * 600.0 - 1)
-    run("integrate out/sphere --overwrite", code=3, says=f"the surface of {n_pixels} pixels takes")
+    run("integrate out/sphere --overwrite", input_error=f"the surface of {n_pixels} pixels takes")
+
+
+DAMAGED_REPORTS = """
+options | crop | 5
+options | scale | 3
+options | pixel_size | [1]
+options | convention | null
+options | discontinuity | -1
+ | options | 7
+ | options | {}
+ | files | ["normals.npy", 5]
+ | file_sizes | 7
+ | camera_matrix | [[0, 0, 0], [0, 0, 0], [0, 0, 0]]
+ | camera_matrix | 1
+ | near_lamps | 1
+ | near_lamps | {"camera": "perspective", "camera_matrix": [[0, 0, 0], [0, 0, 0], [0, 0, 0]]}
+"""
 
 
 def test_a_damaged_report_is_named(run, capture):
     run(f"infer {capture} --method ls --format npy --surface")
     path = Path("out", capture, "report.json")
     whole = read_json(path)
-    for where, key, value in (
-        ("options", "crop", 5),
-        ("options", "scale", 3),
-        ("options", "pixel_size", [1]),
-        ("options", "convention", None),
-        ("options", "discontinuity", -1),
-        ("", "options", 7),
-        ("", "options", {}),
-        ("", "files", ["normals.npy", 5]),
-        ("", "file_sizes", 7),
-        ("", "camera_matrix", [[0, 0, 0]] * 3),
-        ("", "camera_matrix", 1),
-        ("", "near_lamps", 1),
-        ("", "near_lamps", {"camera": "perspective", "camera_matrix": [[0, 0, 0]] * 3}),
-    ):
+    for where, key, value in table(DAMAGED_REPORTS):
         report = deepcopy(whole)
-        (report[where] if where else report)[key] = value
-        path.write_text(json.dumps(report))
+        (report[where] if where else report)[key] = json.loads(value)
+        put(path, json.dumps(report))
         problem = (
-            " is damaged"
-            if key in ("files", "file_sizes")
-            else ": the report is damaged, or from another version"
+            " is damaged" if "file" in key else ": the report is damaged, or from another version"
         )
-        result = run(f"integrate {path.parent} -o again", code=3, says=f"report.json{problem}")
-        assert result.err.count("\n") == 1
+        says = f"report.json{problem}"
+        assert run(f"integrate {path.parent} -o again", input_error=says).err.count("\n") == 1
 
 
 def test_refusals(refuse):
@@ -386,10 +376,10 @@ def test_refusals(refuse):
     dot, corner = np.zeros((*SHAPE, 3), np.float32), np.zeros(SHAPE, np.uint8)
     dot[3, 3, 2], corner[0, 0] = 1, 255
     np.save("dot.npy", dot)
-    cv2.imwrite("small.png", np.full((10, 10), 255, np.uint8))
-    cv2.imwrite("corner.png", corner)
-    Path("camera.txt").write_text("200 0 24.5\n0 200 19.5\n")
-    Path("mirrored.txt").write_text("-200 0 24.5\n0 200 19.5\n0 0 1\n")
+    write_image("small.png", np.full((10, 10), 255, np.uint8))
+    write_image("corner.png", corner)
+    put("camera.txt", "200 0 24.5\n0 200 19.5\n")
+    put("mirrored.txt", "-200 0 24.5\n0 200 19.5\n0 0 1\n")
     Path("done").mkdir()
     Path("done/mesh.ply").touch()
     cases = """

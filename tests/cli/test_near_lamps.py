@@ -6,10 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pytest import approx
 
-from cli.conftest import table
 from cli.test_schema import check
-from scenes import BUMP_LAMPS, BUMP_MM, codes, read_image, write_bump, write_image
+from scenes import (
+    BUMP_LAMPS,
+    BUMP_MM,
+    codes,
+    parametrize,
+    pinhole,
+    put,
+    read_image,
+    write_bump,
+    write_image,
+)
 from splinecli.maths.normals import unit
 
 
@@ -41,7 +51,7 @@ def test_one_distance_for_all_lamps(mean_error, bump):
 def near(bump):
     """The bump with the files that tell where its lamps are."""
     np.savetxt(bump / "light_positions.txt", BUMP_LAMPS)
-    (bump / "pixel_size.txt").write_text("2\n")
+    put(bump / "pixel_size.txt", "2\n")
     return bump
 
 
@@ -50,9 +60,7 @@ def test_files_and_options_mean_the_same(run, infer, mean_error, near):
     assert report["angular_error_deg"]["mean"] < 0.1
     assert codes(report) == ["few_lights"]
     assert report["near_lamps"]["pixel_size"] == 2
-    assert report["near_lamps"]["distances"] == pytest.approx(
-        np.linalg.norm(BUMP_LAMPS, axis=1), abs=1e-3
-    )
+    assert report["near_lamps"]["distances"] == approx(np.linalg.norm(BUMP_LAMPS, axis=1), abs=1e-3)
     assert (
         "lamps        near, as in bump/light_positions.txt; a pixel is 2 wide"
         in run("info bump").out
@@ -78,8 +86,7 @@ def test_distant_lights_despite_positions_are_warned_of(infer, near):
     warning, _ = infer("--lights directions.txt")["warnings"]
     assert warning["code"] == "near_lamps"
     # The middles of the outermost pixels.
-    corners = np.array([(x, y, 0) for x in (-31, 31) for y in (-31, 31)])
-    towards = BUMP_LAMPS[:, None] - corners
+    towards = BUMP_LAMPS[:, None] - np.array([(x, y, 0) for x in (-31, 31) for y in (-31, 31)])
     cosine = (towards * BUMP_LAMPS[:, None]).sum(axis=2) / np.linalg.norm(towards, axis=2)
     angle = np.degrees(np.arccos(cosine / np.linalg.norm(BUMP_LAMPS, axis=1)[:, None])).max()
     assert f"a light direction changes by up to {angle:.0f} degrees" in warning["text"]
@@ -102,56 +109,32 @@ REFUSED = """
 """
 
 
-@pytest.mark.parametrize("arguments, code, message", table(REFUSED))
+@parametrize("arguments, code, message", REFUSED)
 def test_refused_options(run, bump, arguments, code, message):
     np.savetxt(bump / "light_directions.txt", BUMP_LAMPS)
     np.savetxt("l.txt", BUMP_LAMPS)
     run(f"infer bump --method ls {arguments}", code=int(code), says=message)
 
 
-def test_wrong_files_are_named(run, near):
-    for name, text, message in (
-        ("pixel_size.txt", "1 2\n", 'pixel_size.txt:1: found "1 2", expected one number above 0'),
-        (
-            "pixel_size.txt",
-            "# width\n0.9 mm\n",
-            'pixel_size.txt:2: found "0.9 mm", expected one number',
-        ),
-        (
-            "camera_matrix.txt",
-            "1 2\n3 4\n",
-            "camera_matrix.txt: found 2 x 2 numbers, expected 3 x 3",
-        ),
-        ("camera_matrix.txt", "-1 0 0\n0 1 0\n0 0 1\n", "not a"),
-        (
-            "light_positions.txt",
-            "1 2 -3\n" * 7,
-            "light_positions.txt:1: found a lamp behind the object",
-        ),
-        ("light_positions.txt", "0 0 0\n" * 7, "found a zero vector, expected a lamp position"),
-        ("light_positions.txt", "1 2 3\n" * 5, "found 5 lamp positions, expected 7"),
-        ("light_lobes.txt", "0 0 -1 2\n" * 3, "light_lobes.txt: found 3 lines, expected 1 or 7"),
-        (
-            "light_lobes.txt",
-            "# LEDs\n0 0 -1\n",
-            'light_lobes.txt:2: found "0 0 -1", expected x y z mu',
-        ),
-        (
-            "light_lobes.txt",
-            "0 0 -1 -2\n",
-            'light_lobes.txt:1: found "0 0 -1 -2", expected x y z mu',
-        ),
-        (
-            "light_lobes.txt",
-            "0 0 -1 2\n" * 6 + "0 0 1 2\n",
-            "light_lobes.txt:7: lamp 7 shines away from the object",
-        ),
-    ):
-        (near / "pixel_size.txt").write_text("2\n")
-        np.savetxt(near / "light_positions.txt", BUMP_LAMPS)
-        (near / name).write_text(text)
-        run("infer bump --method ls", code=3, says=message)
-        (near / name).unlink()
+WRONG_FILES = r"""
+pixel_size.txt | 1 2\n | pixel_size.txt:1: found "1 2", expected one number above 0
+pixel_size.txt | # width\n0.9 mm\n | pixel_size.txt:2: found "0.9 mm", expected one number
+camera_matrix.txt | 1 2\n3 4\n | camera_matrix.txt: found 2 x 2 numbers, expected 3 x 3
+camera_matrix.txt | -1 0 0\n0 1 0\n0 0 1\n | not a
+light_positions.txt | 1 2 -3\n1 2 3\n1 2 3\n1 2 3\n1 2 3\n1 2 3\n1 2 3 | lamp behind the object
+light_positions.txt | 0 0 0\n1 2 3\n1 2 3\n1 2 3\n1 2 3\n1 2 3\n1 2 3 | found a zero vector
+light_positions.txt | 1 2 3\n1 2 3\n1 2 3\n1 2 3\n1 2 3 | found 5 lamp positions, expected 7
+light_lobes.txt | 0 0 -1 2\n0 0 -1 2\n0 0 -1 2\n | lobes.txt: found 3 lines, expected 1 or 7
+light_lobes.txt | # LEDs\n0 0 -1\n | light_lobes.txt:2: found "0 0 -1", expected x y z mu
+light_lobes.txt | 0 0 -1 -2\n | light_lobes.txt:1: found "0 0 -1 -2", expected x y z mu
+light_lobes.txt | # LED\n0 0 1 2\n | light_lobes.txt:2: lamp 1 shines away from the object
+"""
+
+
+@parametrize("name, text, message", WRONG_FILES)
+def test_wrong_files_are_named(run, near, name, text, message):
+    put(near / name, text)
+    run("infer bump --method ls", input_error=message)
 
 
 def test_a_near_camera_under_distant_lights(run, document, infer, mean_error, bump):
@@ -161,44 +144,45 @@ def test_a_near_camera_under_distant_lights(run, document, infer, mean_error, bu
     np.savetxt(bump / "light_directions.txt", BUMP_LAMPS)
     orthographic = infer()
     assert orthographic["camera_matrix"] is None
-    matrix = np.array([(40, 0, 16.5), (0, 40, 15.5), (0, 0, 1)])
+    matrix = pinhole(40, 16.5, 15.5)
     np.savetxt("camera.txt", matrix)
     np.savetxt(bump / "camera_matrix.txt", matrix)
     run("infer bump --method ls", code=5, says="other input files")
     found = infer()
     check(found, "Report")
-    assert (found["camera_matrix"], found["near_lamps"]) == (matrix.tolist(), None)
+    assert found["camera_matrix"] == matrix.tolist()
+    assert found["near_lamps"] is None
     assert found["inputs_sha256"] != orthographic["inputs_sha256"]
     assert found["angular_error_deg"] == orthographic["angular_error_deg"]
     assert "camera       perspective, focal length 40 pixels" in run("info bump").out
     given = infer("--camera-matrix camera.txt --crop 4,2,20,24")
-    assert given["camera_matrix"] == [[40, 0, 12.5], [0, 40, 13.5], [0, 0, 1]]
+    assert given["camera_matrix"] == pinhole(40, 12.5, 13.5).tolist()
     scored = document("evaluate bump --method ia14 --n-lights all")["results"][0]
-    assert scored["mae_deg"] == pytest.approx(mean_error("--method ia14"), abs=1e-3)
+    assert scored["mae_deg"] == approx(mean_error("--method ia14"), abs=1e-3)
     (bump / "camera_matrix.txt").unlink()
-    assert scored["mae_deg"] != pytest.approx(mean_error("--method ia14"), abs=1e-3)
+    assert scored["mae_deg"] != approx(mean_error("--method ia14"), abs=1e-3)
 
 
 def test_a_file_of_lobes(run, infer, mean_error, near):
     """One line is for all lamps. The frame of the positions is that of the lobes, too."""
     without = infer()
-    (near / "light_lobes.txt").write_text("0 0.2 -1 0\n")
+    put(near / "light_lobes.txt", "0 0.2 -1 0\n")
     run("infer bump --method ls", code=5, says="other input files")
     even = infer()
     check(even, "Report")
-    assert even["near_lamps"]["lobes"] == [pytest.approx([0, 0.1961, -0.9806, 0], abs=1e-4)] * 7
-    assert even["angular_error_deg"]["mean"] == pytest.approx(
+    assert even["near_lamps"]["lobes"] == [approx([0, 0.1961, -0.9806, 0], abs=1e-4)] * 7
+    assert even["angular_error_deg"]["mean"] == approx(
         without["angular_error_deg"]["mean"], abs=1e-3
     )
-    (near / "light_lobes.txt").write_text("0 0.2 -1 5\n")
+    put(near / "light_lobes.txt", "0 0.2 -1 5\n")
     narrow = infer()
     assert narrow["angular_error_deg"]["mean"] > without["angular_error_deg"]["mean"] + 0.1
     np.savetxt(near / "light_positions.txt", BUMP_LAMPS * (1, -1, 1))
-    (near / "light_lobes.txt").write_text("0 -0.2 -1 5\n")
+    put(near / "light_lobes.txt", "0 -0.2 -1 5\n")
     assert mean_error("--light-frame y-down") == narrow["angular_error_deg"]["mean"]
 
 
-@pytest.mark.parametrize("command", ["infer", "info"])
+@parametrize("command", "infer info")
 def test_positions_in_another_unit_than_the_pixel_size(run, near, command):
     """The bump is 64 mm wide, its lamps 162 mm away and more: in metres they would be inside the
     bump.
@@ -211,11 +195,9 @@ def test_positions_in_another_unit_than_the_pixel_size(run, near, command):
         " which is 64"
     )
     words = "so it would be inside. Use one unit, such as millimetres, for all lengths"
-    run(f"{arguments} --strict", code=3, says=(lamp, words))
-    for factor, words in (
-        (0.3, "A lamp is very near"),
-        (1000, "so far away that their light is parallel"),
-    ):
+    run(f"{arguments} --strict", input_error=(lamp, words))
+    far = "so far away that their light is parallel"
+    for factor, words in ((0.3, "A lamp is very near"), (1000, far)):
         np.savetxt(near / "light_positions.txt", BUMP_LAMPS * factor)
         for strict, code in (("--strict", 3), ("", 0)):
             run(f"{arguments} {strict}", code=code, says=words)
@@ -231,7 +213,7 @@ def test_evaluate_and_prepare(run, document, near):
 
     assert max(error("--n-lights 5"), error("--n-lights 5 --max-pixels 50")) < 0.2
     assert error("--n-lights all --light-noise-deg 4") > 0.5
-    run("prepare bump -o set", code=3, says="near lamps, and training needs distant lights")
+    run("prepare bump -o set", input_error="near lamps, and training needs distant lights")
 
 
 def test_albedo_and_saturation(infer, near):
@@ -239,8 +221,7 @@ def test_albedo_and_saturation(infer, near):
     restored.
     """
     for path in near.glob("*.png"):
-        image = read_image(path)
-        write_image(path, np.minimum(image, 26_000))
+        write_image(path, np.minimum(read_image(path), 26_000))
     stored = infer("--white-level 26000 --as-stored")
     restored = infer("--white-level 26000 --maps albedo")
     assert restored["angular_error_deg"]["mean"] < 0.5 * stored["angular_error_deg"]["mean"]

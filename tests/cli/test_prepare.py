@@ -1,17 +1,15 @@
 """`splinecli prepare`: captures, CyclesPS trees and rendered scenes, continuation, and refusals."""
 
-import json
 import shutil
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from capture.test_cyclesps import normals, write_object
 from kills import content
-from scenes import read_image, read_json, write_image
+from scenes import assert_unit, parametrize, put, read_image, read_json, write_image
 
 
 @pytest.fixture
@@ -28,14 +26,12 @@ def arrays(entry):
 
 
 def test_a_capture(run, capture, truth):
-    result = run(
-        f"prepare {capture} -o set",
-        out="set: 1 entries of 1 scenes, 448 pixels, 0 MB; overview in set/contact_sheet.png\n",
-    )
-    assert result.err == "sphere: 448 pixels, 8 lights, sphere\n"
+    out = "set: 1 entries of 1 scenes, 448 pixels, 0 MB; overview in set/contact_sheet.png\n"
+    run(f"prepare {capture} -o set", out=out, err="sphere: 448 pixels, 8 lights, sphere\n")
     found = arrays("sphere")
     mask = found["mask"]
-    assert (mask.shape, mask.sum()) == ((24, 24), 448)
+    assert mask.shape == (24, 24)
+    assert mask.sum() == 448
     assert_allclose(found["normals"], truth[mask], atol=1e-6)
     expected = (truth[mask] @ found["light_directions"].T) * 60_000 / 65_535
     assert_allclose(found["observations"], expected, atol=1e-5)
@@ -43,7 +39,8 @@ def test_a_capture(run, capture, truth):
 
 def test_a_cycles_tree_reads_to_the_values_put_in(document, cycles_images):
     summary = document("prepare cycles -o set")
-    assert (summary["entries"], summary["scenes"]) == (3, 1)
+    assert summary["entries"] == 3
+    assert summary["scenes"] == 1
     whole, half = arrays("Turtle_diffuse"), arrays("Turtle_specular")
     # The masks are a box of 5 x 7 pixels.
     expected = {
@@ -64,7 +61,7 @@ def test_a_cycles_tree_reads_to_the_values_put_in(document, cycles_images):
 def test_the_same_command_continues(run, make_capture):
     one, two = make_capture("one"), make_capture("two")
     shutil.move(two / "image3.png", "hidden.png")
-    result = run(f"prepare {one} {two} -o set", code=3, says="two")
+    result = run(f"prepare {one} {two} -o set", input_error="two")
     # The good capture is in the set, and the bad one is named.
     assert result.out.startswith("set: 1 entries of 1 scenes, 448 pixels")
     before = Path("set/one/observations.npy").stat()
@@ -77,10 +74,7 @@ def test_captures_of_one_name_get_entries_of_their_own(run, make_capture):
     capture = make_capture("a")
     shutil.copytree(capture, "b/a")
     times = []
-    for sources in (
-        (capture, "b", capture),
-        ("b", capture),
-    ):  # they keep their names in another order
+    for sources in ((capture, "b", capture), ("b", capture)):  # names stay in another order
         run("prepare -o set --quiet", *sources)
         assert {path.name for path in Path("set").iterdir() if path.is_dir()} == {"a", "a-2"}
         times.append([Path(f"set/{name}/normals.npy").stat().st_mtime_ns for name in ("a", "a-2")])
@@ -88,8 +82,8 @@ def test_captures_of_one_name_get_entries_of_their_own(run, make_capture):
 
 
 CHANGES = {
-    "ambient": lambda folder: cv2.imwrite(
-        str(folder / "ambient.png"), np.full((24, 24), 600, np.uint16)
+    "ambient": lambda folder: write_image(
+        folder / "ambient.png", np.full((24, 24), 600, np.uint16)
     ),
     "truth": lambda folder: np.save(
         folder / "normals_gt.npy", np.load(folder / "normals_gt.npy")[::-1]
@@ -97,23 +91,20 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("change", CHANGES)
+@parametrize("change", CHANGES)
 def test_a_changed_capture_is_named_and_read_again_with_update(run, make_capture, change):
     one, two = make_capture("one"), make_capture("two")
     run(f"prepare {one} -o set --quiet")
     before = arrays("one")
     CHANGES[change](one)
-    result = run(f"prepare {one} {two} -o set --json", code=5)
-    # The stale entry is kept and named, and the other capture is added.
-    summary = result.json
     hint = "Add --update to read it again, or choose another -o."
     message = f"one: its files changed since the entry one was made. {hint}"
-    assert result.err == f"splinecli: {message}\ntwo: 448 pixels, 8 lights, two\n"
-    assert (summary["entries"], summary["skipped"]) == (
-        2,
-        [{"source": "one", "reason": message, "exit_code": 5}],
-    )
-    np.testing.assert_array_equal(arrays("one")["observations"], before["observations"])
+    err = f"splinecli: {message}\ntwo: 448 pixels, 8 lights, two\n"
+    # The stale entry is kept and named, and the other capture is added.
+    summary = run(f"prepare {one} {two} -o set --json", code=5, err=err).json
+    assert summary["entries"] == 2
+    assert summary["skipped"] == [{"source": "one", "reason": message, "exit_code": 5}]
+    assert_array_equal(arrays("one")["observations"], before["observations"])
     run(f"prepare {one} {two} -o set --update --quiet")
     after = arrays("one")
     assert any((after[name] != before[name]).any() for name in ("observations", "normals"))
@@ -122,8 +113,8 @@ def test_a_changed_capture_is_named_and_read_again_with_update(run, make_capture
 
 def test_saturated_pixels_are_restored_unless_as_stored(run, capture):
     # One light is 1.4 times as bright, so that some pixels of its image are clipped at 65535.
-    picture = read_image(capture / "image2.png").astype(np.float64)
-    write_image(capture / "image2.png", (1.4 * picture).clip(0, 65535).astype(np.uint16))
+    picture = np.float64(read_image(capture / "image2.png"))
+    write_image(capture / "image2.png", np.uint16((1.4 * picture).clip(0, 65535)))
     np.savetxt(capture / "light_intensities.txt", [[1.4 if i == 1 else 1] * 3 for i in range(8)])
     run(f"prepare {capture} -o set --quiet")
     run(f"prepare {capture} -o raw --as-stored --quiet")
@@ -132,27 +123,20 @@ def test_saturated_pixels_are_restored_unless_as_stored(run, capture):
     assert (np.abs(stored - expected).max(axis=1) > 0.01).sum() > 20
     assert_allclose(found["observations"], expected, atol=2e-3)
     # The two readings do not share an entry.
-    run(
-        f"prepare {capture} -o raw",
-        code=5,
-        says="was made with reading = 'as stored', not 'restored'",
-    )
+    says = "was made with reading = 'as stored', not 'restored'"
+    run(f"prepare {capture} -o raw", code=5, says=says)
 
 
 @pytest.fixture
-def cube():
-    """A cube's mesh, its top turned to the camera."""
-    pytest.importorskip("embreex", reason="needs the extra 'render'")
-    corners = [f"v {x} {y} {z}" for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
-    sides = ["1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"]
-    Path("cube.obj").write_text("\n".join([*corners, *(f"f {side}" for side in sides)]) + "\n")
-    return Path("cube.obj")
+def cube(coarse_shapes):
+    """A cube's mesh, its top turned to the camera. Other shapes are coarser, for speed."""
+    pytest.importorskip("embreex")
+    corners = "".join(f"v {x} {y} {z}\n" for x in (-1, 1) for y in (-1, 1) for z in (-1, 1))
+    sides = "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
+    return put("cube.obj", corners + sides)
 
 
-def test_scenes_and_a_mesh_are_rendered(run, cube, monkeypatch):
-    # Coarser shapes, for speed.
-    monkeypatch.setattr("splinecli.workshop.synthesis.shapes.SPACING", 0.04)
-    monkeypatch.setattr("splinecli.workshop.synthesis.shapes.FEWEST_FACES", 100)
+def test_scenes_and_a_mesh_are_rendered(run, cube):
     arguments = f"prepare --mesh {cube} --size 16 --n-lights 20 -o set"
     result = run(f"{arguments} --scenes 1")
     assert result.out.startswith("set: 18 entries of 2 scenes, ")
@@ -162,7 +146,7 @@ def test_scenes_and_a_mesh_are_rendered(run, cube, monkeypatch):
         assert found["observations"].dtype == np.float16
         assert found["observations"].shape == (found["mask"].sum(), 20)
         assert (found["observations"] >= 0).all() and found["observations"].max() > 0
-        assert_allclose(np.linalg.norm(found["normals"], axis=1), 1, atol=1e-5)
+        assert_unit(found["normals"])
     # The middle of the cube's top looks at the camera.
     normal_map = np.zeros((16, 16, 3))
     normal_map[found["mask"]] = found["normals"]
@@ -172,21 +156,16 @@ def test_scenes_and_a_mesh_are_rendered(run, cube, monkeypatch):
     run(f"{arguments} --scenes 2 --quiet")
     assert Path("set/scene0000-diffuse/observations.npy").read_bytes() == before
     assert Path("set/scene0001-diffuse").is_dir()
-    run(
-        f"{arguments} --scenes 2 --seed 1",
-        code=5,
-        says="the entry cube-diffuse was made with seed = 0, not 1. Choose",
-    )
+    says = "the entry cube-diffuse was made with seed = 0, not 1. Choose"
+    run(f"{arguments} --scenes 2 --seed 1", code=5, says=says)
 
 
 def test_groups_have_the_meshes_as_bodies(run, cube, monkeypatch):
-    monkeypatch.setattr("splinecli.workshop.synthesis.shapes.SPACING", 0.05)
     monkeypatch.setattr("splinecli.workshop.synthesis.groups.SPACING", 0.05)
     monkeypatch.setattr("splinecli.workshop.synthesis.groups.FEWEST_FACES", 100)
     arguments = f"prepare --mesh {cube} --groups 2 --size 16 --n-lights 20 -o set"
-    result = run(arguments)
-    assert result.out.startswith("set: 18 entries of 2 scenes, ")
-    manifest = json.loads(Path("set/manifest.json").read_text())
+    assert run(arguments).out.startswith("set: 18 entries of 2 scenes, ")
+    manifest = read_json("set/manifest.json")
     assert {entry["scene"] for entry in manifest["entries"]} == {"group0000", "group0001"}
     assert not Path("set/cube-diffuse").exists()
     # With --views, the mesh is also rendered alone; the groups stay.
@@ -195,8 +174,8 @@ def test_groups_have_the_meshes_as_bodies(run, cube, monkeypatch):
 
 
 def test_workers_render_the_same_set(run, cube):
-    pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    Path("block.obj").write_text(cube.read_text())
+    pytest.importorskip("distributed")
+    put("block.obj", cube.read_text())
     more = "--mesh block.obj --scenes 1"
     arguments = f"prepare --mesh {cube} --size 16 --n-lights 20"
     alone = run(f"{arguments} {more} -o alone")
@@ -207,11 +186,9 @@ def test_workers_render_the_same_set(run, cube):
 
 
 def test_a_mesh_that_the_camera_cannot_see(run, cube):
-    Path("back.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 3 2\n")
-    result = run("prepare --mesh back.obj --size 16 --n-lights 20 -o set", code=3, out="")
-    assert result.err.startswith(
-        "splinecli: back.obj: no face of the mesh is visible to the camera. The camera looks"
-    )
+    put("back.obj", "v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 3 2\n")
+    says = "splinecli: back.obj: no face of the mesh is visible to the camera. The camera looks"
+    run("prepare --mesh back.obj --size 16 --n-lights 20 -o set", code=3, out="", says=says)
 
 
 def test_refusals(refuse, make_capture, cycles_images):
@@ -219,8 +196,8 @@ def test_refusals(refuse, make_capture, cycles_images):
     (blind / "normals_gt.npy").unlink()
     Path("cycles/PRPS/Turtle/images_metallic/00002.tif").unlink()
     Path("full").mkdir()
-    Path("full/notes.txt").write_text("mine")
-    Path("cube.txt").write_text("no mesh")
+    put("full/notes.txt", "mine")
+    put("cube.txt", "no mesh")
     cases = f"""
         2 -o set
         3 missing -o set

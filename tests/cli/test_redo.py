@@ -9,10 +9,8 @@ from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
-import pytest
-
-from cli.conftest import read_report, table
-from scenes import read_json
+from cli.conftest import read_report
+from scenes import names_in, parametrize, put, read_json, table
 from splinecli.pipeline.batch import infer_batch
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.system.files import UNFINISHED
@@ -23,12 +21,11 @@ from tiny_networks import random_network
 
 def test_refuses_to_overwrite(capture, run, golden):
     run(f"infer {capture} --method ls")
-    before = read_report(Path("out/sphere"))
-    result = run(f"infer {capture} --method ls --n-lights 4", code=5, out="")
-    golden("error_exists.txt", result.err)
-    assert read_report(Path("out/sphere")) == before
+    before = read_report()
+    golden("error_exists.txt", run(f"infer {capture} --method ls --n-lights 4", code=5, out="").err)
+    assert read_report() == before
     run(f"infer {capture} --method ls --n-lights 4 --overwrite")
-    assert read_report(Path("out/sphere"))["n_lights"] == 4
+    assert read_report()["n_lights"] == 4
 
 
 def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
@@ -37,15 +34,12 @@ def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
     whole = broken.read_bytes()
     broken.write_bytes(b"no picture")
     captures = ("sphere", "second", "third")
-    run("infer --method ls", *captures, code=3, says="3 captures: 2 done, 1 failed; see")
+    run("infer --method ls", *captures, input_error="3 captures: 2 done, 1 failed; see")
     before = [Path("out", name, "normals.npy").stat().st_mtime_ns for name in captures[:2]]
     broken.write_bytes(whole)
     Path("out", f".index.html.x{UNFINISHED}").touch()  # a killed process was writing this
-    again = run(
-        "infer --method ls",
-        *captures,
-        says=(f"splinecli: warning: out: {UNDONE}", "out/second: already done, skipped\n"),
-    )
+    says = f"splinecli: warning: out: {UNDONE}", "out/second: already done, skipped\n"
+    again = run("infer --method ls", *captures, says=says)
     assert again.out.startswith("out/third: ")
     assert again.err.endswith("3 captures: 1 done, 2 already done; see out/index.html\n")
     assert before == [Path("out", name, "normals.npy").stat().st_mtime_ns for name in captures[:2]]
@@ -55,7 +49,7 @@ def test_a_batch_goes_on_where_it_ended(capture, make_capture, run):
 
 
 def replace_in(path, old, new):
-    path.write_text(path.read_text().replace(old, new, 1))
+    put(path, path.read_text().replace(old, new, 1))
     return ""
 
 
@@ -70,27 +64,25 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("reason", CHANGES)
-@pytest.mark.parametrize("others", ["", "second"], ids=["one", "several"])
+@parametrize("reason", CHANGES)
+@parametrize("others", ["", "second"], ids=["one", "several"])
 def test_changed_captures_are_kept_or_redone(capture, make_capture, run, reason, others):
     """One capture and several obey the same rules."""
     make_capture("second")
     call = f"infer {capture} {others} --method ls"
     run(call)
     extra = CHANGES[reason](capture)
-    before = (Path("out/sphere/normals.npy").stat().st_mtime_ns, read_report(Path("out/sphere")))
+    normals = Path("out/sphere/normals.npy")
+    before = normals.stat().st_mtime_ns, read_report()
     kept = run(f"{call} {extra}", code=5, out="")
     line = next(line for line in kept.err.splitlines() if "out/sphere: " in line)
     assert reason in line
     assert "Add --update to redo what changed, --overwrite to redo everything" in line
-    assert (
-        Path("out/sphere/normals.npy").stat().st_mtime_ns,
-        read_report(Path("out/sphere")),
-    ) == before
+    assert (normals.stat().st_mtime_ns, read_report()) == before
     first, *_ = run(f"{call} {extra} --json", code=5).json
     assert (first["capture"], first["exit_code"], reason in first["error"]) == ("sphere", 5, True)
     updated = run(f"{call} {extra} --update")
-    assert Path("out/sphere/normals.npy").stat().st_mtime_ns > before[0]
+    assert normals.stat().st_mtime_ns > before[0]
     if others and not extra:
         assert "out/second: already done, skipped" in updated.err
     run(f"{call} {extra}")
@@ -102,8 +94,7 @@ def link_elsewhere(path):
 
 
 def surrogate_among_files(path):
-    report = read_json(path)
-    path.write_text(json.dumps({**report, "files": ["\ud800"]}))
+    put(path, json.dumps({**read_json(path), "files": ["\ud800"]}))
 
 
 UNFINISHED_FOLDERS = {
@@ -120,25 +111,20 @@ UNFINISHED_FOLDERS = {
 }
 
 
-@pytest.mark.parametrize("name", UNFINISHED_FOLDERS)
+@parametrize("name", UNFINISHED_FOLDERS)
 def test_an_unfinished_folder_is_computed_again(capture, run, name):
     call = f"infer {capture} --method ls"
     run(call)
-    whole = {path.name for path in Path("out/sphere").iterdir()}
+    whole = names_in("out/sphere")
     file, damage, reason = UNFINISHED_FOLDERS[name]
     damage(Path("out/sphere", file))
     elsewhere = {path: path.read_bytes() for path in Path().glob("elsewhere")}
-    again = run(call, says=(reason, "so it is computed again"))
-    assert again.out[:11] == "out/sphere:"
-    assert {path.name for path in Path("out/sphere").iterdir()} == whole
+    assert run(call, says=(reason, "so it is computed again")).out[:11] == "out/sphere:"
+    assert names_in("out/sphere") == whole
     assert not any(path.is_symlink() for path in Path("out/sphere").iterdir())
     assert {path: path.read_bytes() for path in elsewhere} == elsewhere
-    sizes = {
-        path.name: path.stat().st_size
-        for path in Path("out/sphere").iterdir()
-        if path.suffix != ".json"
-    }
-    assert read_report(Path("out/sphere"))["file_sizes"] == sizes
+    sizes = {name: Path("out/sphere", name).stat().st_size for name in whole - {"report.json"}}
+    assert read_report()["file_sizes"] == sizes
     run(call, says="already done, skipped")
 
 
@@ -159,42 +145,38 @@ def test_a_link_in_the_place_of_a_result_folder_fails_its_capture_only(capture, 
     Path("out").mkdir()
     Path("out/sphere").symlink_to(Path("elsewhere").absolute())
     for overwrite in ("", "--overwrite"):
-        run(
-            f"infer {capture} second --method ls",
-            *overwrite,
-            code=5,
-            says="out/sphere: found a link, expected a folder",
-        )
+        says = "out/sphere: found a link, expected a folder"
+        run(f"infer {capture} second --method ls {overwrite}", code=5, says=says)
         assert Path("out/second/report.json").is_file()
         assert not list(Path("elsewhere").iterdir())
 
 
-BAD_REPORTS = [
-    ("files", [1, 2]),
-    ("files", ["\ud800"]),
-    ("files", ["../../kept"]),
-    ("files", {"a": 1}),
-    ("file_sizes", 5),
-    ("file_sizes", None),
-    ("warnings", [1]),
-    ("warnings", [{"text": ["\ud800"]}]),
-    ("seconds", {"read": "x"}),
-    ("n_pixels", "\ud800"),
-    ("angular_error_deg", {"mean": []}),
-    ("capture", "\ud800"),
-    ("error", ["\ud800"]),
-]
+BAD_REPORTS = r"""
+files | [1, 2]
+files | ["\ud800"]
+files | ["../../kept"]
+files | {"a": 1}
+file_sizes | 5
+file_sizes | null
+warnings | [1]
+warnings | [{"text": ["\ud800"]}]
+seconds | {"read": "x"}
+n_pixels | "\ud800"
+angular_error_deg | {"mean": []}
+capture | "\ud800"
+error | ["\ud800"]
+"""
 
 
 def test_bad_reports_of_other_captures_are_no_matter(capture, make_capture, run):
-    names = [str(make_capture(f"c{number}")) for number in range(len(BAD_REPORTS))]
+    bad = table(BAD_REPORTS)
+    names = [str(make_capture(f"c{number}")) for number in range(len(bad))]
     run("infer --method ls", *names)
     Path("kept").touch()
-    for name, (key, value) in zip(names, BAD_REPORTS, strict=True):
+    for name, (key, value) in zip(names, bad, strict=True):
         path = Path("out", name, "report.json")
-        path.write_text(json.dumps({**read_json(path), key: value}))
-    result = run(f"infer {capture} {make_capture('third')} --method ls")
-    assert "Traceback" not in result.err
+        put(path, json.dumps({**read_json(path), key: json.loads(value)}))
+    assert "Traceback" not in run(f"infer {capture} {make_capture('third')} --method ls").err
     page = Path("out/index.html").read_text("utf-8")
     assert "sphere" in page and "third" in page
     # The same where the captures themselves come next.
@@ -204,14 +186,10 @@ def test_bad_reports_of_other_captures_are_no_matter(capture, make_capture, run)
 
 
 def test_files_of_the_user_in_the_capture_are_kept(capture, run):
-    (capture / "normals.png").write_text("drawn by hand")
+    put(capture / "normals.png", "drawn by hand")
     for update in ("", "--update"):
-        run(
-            f"infer {capture} --method ls -o {capture.parent}",
-            *update,
-            code=5,
-            says="sphere: contains normals.png, but no report.json",
-        )
+        says = "sphere: contains normals.png, but no report.json"
+        run(f"infer {capture} --method ls -o {capture.parent} {update}", code=5, says=says)
     assert (capture / "normals.png").read_text() == "drawn by hand"
 
 
@@ -250,13 +228,10 @@ def test_captures_are_computed_as_they_arrive_and_only_once(
     result = run(command, code=130, says="parts: the folder is available again")
     failed, again, done = map(json.loads, result.out.splitlines())
     assert (failed["capture"], failed["exit_code"]) == ("bad", 3) and again == failed
-    assert (
-        result.err.count(
-            "parts: the folder cannot be read (No such file or directory). Waiting for it."
-        )
-        == 1
-    )
-    assert (done["capture"], done["method"]) == ("-first 1", "ls")
+    message = "parts: the folder cannot be read (No such file or directory). Waiting for it."
+    assert result.err.count(message) == 1
+    assert done["capture"] == "-first 1"
+    assert done["method"] == "ls"
     before = Path("out/-first 1/report.json").stat().st_mtime_ns
     look([])
     run(command, code=130, says="out/-first 1: already done, skipped")
@@ -281,10 +256,10 @@ other | found other after the dashes, expected options of infer
 """
 
 
-@pytest.mark.parametrize("options, problem", table(REFUSED_OPTIONS))
+@parametrize("options, problem", REFUSED_OPTIONS)
 def test_wrong_options_are_refused(run, capture, options, problem):
-    run(f"watch {capture} --settle 0 -- {options}", code=2, says=problem)
+    run(f"watch {capture} --settle 0 -- {options}", usage_error=problem)
 
 
 def test_no_folder(run, capture):
-    run("watch nowhere", code=3, says="nowhere: the folder cannot be read")
+    run("watch nowhere", input_error="nowhere: the folder cannot be read")

@@ -7,7 +7,8 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from scenes import read_json
+from cli.conftest import read_report
+from scenes import parametrize, read_json
 from splinecli.records.capture_warnings import WARNINGS
 from splinecli.records.documents import json_schema
 
@@ -22,7 +23,7 @@ def check(document, name):
     validator.validate(document)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "arguments",
     [
         "--method ls --surface --maps albedo",
@@ -31,7 +32,7 @@ def check(document, name):
 )
 def test_reports_of_infer(capture, run, arguments):
     [printed] = run(f"infer {capture} --json {arguments}").json
-    written = read_json("out/sphere/report.json")
+    written = read_report()
     assert printed == written
     check(written, "Report")
     assert (written["surface"] is None) == ("--surface" not in arguments)
@@ -45,7 +46,7 @@ def test_reports_of_integrate(capture, run):
     check(run("integrate out/sphere --pixel-size 2 --json").json, "SurfaceReport")
 
 
-@pytest.mark.parametrize("lights", ["--n-lights 4", "--n-lights 4 --n-lights all"])
+@parametrize("lights", ["--n-lights 4", "--n-lights 4 --n-lights all"])
 def test_results_of_evaluate(make_capture, run, lights):
     make_capture("data/matte")
     document = run(f"evaluate data --json --method ls --method l1 {lights} --trials 2").json

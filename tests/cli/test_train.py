@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from scenes import read_json
+from kills import content
+from scenes import names_in, parametrize, put, read_json
 from small_pixel_sets import matte_pixels
 from splinecli.system.files import UNFINISHED
 from splinecli.system.publishing import UNDONE
@@ -56,7 +57,7 @@ def test_a_run_and_its_continuation(run, monkeypatch):
     result = run(
         "train -o run --steps 3", says="step 3, 48 pixels", out="run/weights.safetensors\n"
     )
-    assert {path.name for path in Path("run").iterdir()} == SAVED | {"curves.png", "maps.png"}
+    assert names_in("run") == SAVED | {"curves.png", "maps.png"}
     assert settings()["steps"] == 3
     assert settings()["sources"] == {"generator": 1.0}
     assert steps() == ["3"]
@@ -81,15 +82,13 @@ def test_a_run_on_pixel_sets(run, document, no_pictures, make_capture):
     write_set("set")
     write_set("more/set")
     run("train set more/set -o run --n-lights 4-8 --steps 4 --seed 5")
-    assert {path.name for path in Path("run").iterdir()} == SAVED
+    assert names_in("run") == SAVED
     values = settings()
     # A run continues from another working folder.
-    assert values["sources"] == {
-        str(Path("set").absolute()): 1.0,
-        str(Path("more/set").absolute()): 1.0,
-    }
+    assert values["sources"] == {f"{Path.cwd()}/{name}": 1.0 for name in ("set", "more/set")}
     lights = [values["pixels"][name] for name in ("min_lights", "max_lights", "usual_lights")]
-    assert (lights, values["seed"]) == ([4, 8, 8], 5)
+    assert lights == [4, 8, 8]
+    assert values["seed"] == 5
     report = document(f"infer {make_capture('sphere')} --weights run/weights.safetensors")
     assert report["angular_error_deg"]["mean"] < 10
     # First from the same folder, then from another.
@@ -100,15 +99,14 @@ def test_a_run_on_pixel_sets(run, document, no_pictures, make_capture):
 
 
 def test_settings_come_from_preset_file_and_options(run, no_pictures):
-    Path("a.toml").write_text(
-        "seed = 4\nbatch_size = 8\n[pixels]\nwall_share = 0.25\nmax_lights = 20\n"
-    )
+    put("a.toml", "seed = 4\nbatch_size = 8\n[pixels]\nwall_share = 0.25\nmax_lights = 20\n")
     options = "--param batch_size=4 --param pixels.ambient_share=0 --n-lights 12 --steps 1"
     run(f"train -o run --config a.toml {options} --quiet")
     values = settings()
-    assert (values["seed"], values["batch_size"], values["steps"]) == (4, 4, 1)
-    assert (values["pixels"]["wall_share"], values["pixels"]["ambient_share"]) == (0.25, 0)
-    assert (values["pixels"]["min_lights"], values["pixels"]["max_lights"]) == (12, 12)
+    top = {"seed": 4, "batch_size": 4, "steps": 1}
+    assert values | top == values
+    pixels = {"wall_share": 0.25, "ambient_share": 0, "min_lights": 12, "max_lights": 12}
+    assert values["pixels"] | pixels == values["pixels"]
     # The configuration of one run starts another.
     run("train -o other --config run/config.json --seed 9 --quiet")
     assert read_json("other/config.json") == values | {"seed": 9}
@@ -117,13 +115,8 @@ def test_settings_come_from_preset_file_and_options(run, no_pictures):
 def test_tensorboard_is_an_extra(run, no_pictures, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboard", None)
     monkeypatch.delitem(sys.modules, "torch.utils.tensorboard", raising=False)
-    result = run(
-        "train -o run --steps 1 --tensorboard",
-        code=2,
-        says="--tensorboard needs the package tensorboard",
-        out="",
-    )
-    assert result.err.endswith("Run pip install 'splinecli[tensorboard]'.\n")
+    says = "--tensorboard needs the package tensorboard", "Run pip install 'splinecli[tensorboard]'"
+    run("train -o run --steps 1 --tensorboard", usage_error=says, out="")
 
 
 def test_processes_that_cannot_share_a_batch(run, monkeypatch):
@@ -132,7 +125,7 @@ def test_processes_that_cannot_share_a_batch(run, monkeypatch):
     monkeypatch.setattr(
         training_run, "join_workers", lambda device: (training_run.Workers(0, 3), device)
     )
-    run("train -o run --steps 1", code=2, says="3 processes cannot share the 4 shards", out="")
+    run("train -o run --steps 1", usage_error="3 processes cannot share the 4 shards", out="")
     assert not Path("run").exists()
 
 
@@ -147,40 +140,36 @@ def test_a_restarted_worker_continues_by_itself(run, no_pictures, monkeypatch):
 
 def test_resuming_a_finished_run_says_so(run, no_pictures):
     run("train -o run --steps 1")
-    before = {path.name: path.read_bytes() for path in Path("run").iterdir()}
+    before = content(Path("run"))
     Path("run", f".weights.safetensors.x{UNFINISHED}").touch()  # a killed process was writing this
     result = run("train -o run --resume --steps 1", out="run/weights.safetensors\n")
     warning, message = result.err.splitlines()
     assert warning == f"splinecli: warning: run: {UNDONE}"
     assert message.startswith("run: the run is already complete.")
-    assert {path.name: path.read_bytes() for path in Path("run").iterdir()} == before
+    assert content(Path("run")) == before
 
 
-@pytest.mark.parametrize(
-    "damage", [b"\xff\xfe\x00", b"step,pixels\n1,2\n3,4\n", b"\x00" * 50 + b"\n1,2\n"]
-)
+@parametrize("damage", [b"\xff\xfe\x00", b"step,pixels\n1,2\n3,4\n", b"\x00" * 50 + b"\n1,2\n"])
 def test_a_damaged_log_is_kept_aside(run, no_pictures, damage):
     run("train -o run --steps 1 -q")
     damaged = Path("run/metrics.csv").read_bytes() + damage
     Path("run/metrics.csv").write_bytes(damaged)
-    run(
-        "train -o run --resume --steps 2",
-        says="warning: metrics.csv was damaged and has been renamed to run/metrics.damaged.csv",
-    )
+    says = "warning: metrics.csv was damaged and has been renamed to run/metrics.damaged.csv"
+    run("train -o run --resume --steps 2", says=says)
     assert Path("run/metrics.damaged.csv").read_bytes() == damaged
     assert steps() == ["2"]
 
 
 def test_refusals(run, refuse, no_pictures):
     run("train -o run --steps 1")
-    Path("unknown.toml").write_text("[pixels]\nlights = 5\n")
-    Path("broken.toml").write_text("steps =\n")
+    put("unknown.toml", "[pixels]\nlights = 5\n")
+    put("broken.toml", "steps =\n")
     write_set("set")
     write_set("unfinished", finished=False)
     write_set("changed")
     normals = Path("changed/b/normals.npy")
-    content = normals.read_bytes()
-    normals.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    whole = normals.read_bytes()
+    normals.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
     Path("empty").mkdir()
     cases = """
         5 -o run

@@ -5,24 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from numpy.testing import assert_allclose
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 
-from scenes import directions_at
-from splinecli.capture import Capture
+from scenes import as_capture, directions_at, tilted
 from splinecli.estimate.confidence import CaptureFeatures, capture_features
 from splinecli.estimate.inference import estimate_normals
 from splinecli.estimate.methods import make_estimator
 from splinecli.estimate.networks.li_ne_net import CAPTURE_FEATURES, PIXEL_FEATURES, CaptureHead
 from splinecli.estimate.networks.weights import capture_head, manifest
 from splinecli.lights.lighting import PixelLighting
-from splinecli.maths.normals import unit
 from splinecli.maths.transfer import encode_srgb
 
 SIZE = 40
 
 
 def draw_lights(count=12):
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     return directions_at(np.arange(count) * 2.4, np.arccos(rng.uniform(0.5, 0.95, count)))
 
 
@@ -33,25 +32,17 @@ def relief(lights, *, widths=None):
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, SIZE), np.linspace(0.5, -0.5, SIZE))
     heights = 0.03 * np.sin(9 * x) * np.cos(8 * y)
     slopes = 0.27 * np.cos(9 * x) * np.cos(8 * y), -0.24 * np.sin(9 * x) * np.sin(8 * y)
-    normals = unit(np.stack((-slopes[0], -slopes[1], np.ones_like(x)), axis=-1)).reshape(-1, 3)
+    normals = tilted(-slopes[0], -slopes[1]).reshape(-1, 3)
     albedo = 0.5 + 0.3 * np.sin(20 * x * y).reshape(-1, 1)
     shading = normals @ lights.T
     if widths is not None:
-        points = np.stack((x, y, heights), axis=-1).reshape(-1, 1, 3)
-        towards = widths * lights - points
+        towards = widths * lights - np.stack((x, y, heights), axis=-1).reshape(-1, 1, 3)
         distance = np.linalg.norm(towards, axis=2)
         shading = np.einsum("pfc,pc->pf", towards, normals) / distance**3 * widths**2
-    noise = 1 + 0.002 * np.random.default_rng(2).normal(size=shading.shape)
-    observations = (albedo * shading.clip(min=0) * noise).clip(min=0).astype(np.float32)
-    truth = normals.reshape(SIZE, SIZE, 3).astype(np.float32)
-    return Capture(
-        "relief",
-        observations,
-        lights,
-        tuple(range(len(lights))),
-        np.ones((SIZE, SIZE), np.bool_),
-        truth,
-    )
+    noise = 1 + 0.002 * default_rng(2).normal(size=shading.shape)
+    observations = (albedo * shading.clip(min=0) * noise).clip(min=0)
+    truth = np.float32(normals.reshape(SIZE, SIZE, 3))
+    return as_capture(observations, lights, np.ones((SIZE, SIZE), np.bool_), ground_truth=truth)
 
 
 def encoded(capture):
@@ -83,17 +74,15 @@ def test_each_fault_shows_in_its_own_feature():
     assert bent.bend < -0.4  # about 1 / 2.2 - 1, to first order
     assert bent.decoding < np.log(0.5) < right.decoding
     unequal = relief(lights)
-    stops = np.random.default_rng(4).normal(0, 0.3, len(lights))
-    dimmed = features(
-        replace(unequal, observations=(unequal.observations * 2**stops).astype(np.float32))
-    )
+    stops = default_rng(4).normal(0, 0.3, len(lights))
+    dimmed = features(replace(unequal, observations=np.float32(unequal.observations * 2**stops)))
     assert dimmed.light_misfit > right.light_misfit + 1.5
     assert dimmed.free_light_misfit < dimmed.light_misfit - 1.5
 
 
 def test_the_order_of_lights_and_the_exposure_do_not_count():
     capture = relief(draw_lights(), widths=4)
-    order = np.random.default_rng(3).permutation(capture.n_lights)
+    order = default_rng(3).permutation(capture.n_lights)
     other = capture.choose_lights(order.tolist())
     other = replace(other, observations=other.observations * np.float32(37))
     assert_allclose(features(other), features(capture), atol=1e-4)
@@ -102,12 +91,11 @@ def test_the_order_of_lights_and_the_exposure_do_not_count():
 def test_an_untrained_head_changes_little():
     errors = torch.tensor([[-2.0, 1.0], [0.0, 0.5]])
     capture = torch.full((CAPTURE_FEATURES,), torch.nan)
-    turn = CaptureFeatures._fields.index("bend_turn")
-    capture[turn] = np.log(2.0)
+    capture[CaptureFeatures._fields.index("bend_turn")] = np.log(2.0)
     found = CaptureHead()(errors, torch.zeros(2, PIXEL_FEATURES), capture)
     added = np.exp(-3.5) + np.radians(0.6 * 2.0)
     assert_allclose(found[:, 0].exp().detach(), errors[:, 0].exp() + added, rtol=1e-5)
-    np.testing.assert_array_equal(found[:, 1].detach(), errors[:, 1])
+    assert_array_equal(found[:, 1].detach(), errors[:, 1])
 
 
 def claim(capture):

@@ -1,11 +1,9 @@
 """From a capture to a normal map, mostly with least squares, whose result is known."""
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
 
-from scenes import FOUR_LIGHTS
-from splinecli.capture import Capture
+from scenes import FOUR_LIGHTS, as_capture, parametrize
 from splinecli.estimate.inference import estimate_normals, estimate_pixels
 from splinecli.estimate.methods.estimator import TILE_PIXELS, LeastSquares
 from splinecli.lights.lighting import PixelLighting
@@ -23,9 +21,8 @@ def bowl(height=13, width=11):
 
 def capture(ground_truth=None):
     normals, mask = bowl()
-    return Capture(
-        "bowl", 0.7 * normals[mask] @ FOUR_LIGHTS.T, FOUR_LIGHTS, (0, 1, 2, 3), mask, ground_truth
-    )
+    values = 0.7 * normals[mask] @ FOUR_LIGHTS.T
+    return as_capture(values, FOUR_LIGHTS, mask, ground_truth=ground_truth)
 
 
 def test_normals_stand_where_their_pixels_are():
@@ -39,7 +36,7 @@ def test_normals_stand_where_their_pixels_are():
     assert estimate.errors is None
 
 
-@pytest.mark.parametrize("tile_pixels", [1, 7, 10_000])
+@parametrize("tile_pixels", [1, 7, 10_000])
 def test_tiles_change_nothing_but_the_progress(tile_pixels):
     whole = estimate_normals(capture(), LeastSquares())
     done = []
@@ -54,7 +51,7 @@ def test_tiles_change_nothing_but_the_progress(tile_pixels):
     assert max(done) <= tile_pixels
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "near, n_lights, most", [(False, 10, 1 << 19), (True, 10, 1 << 18), (True, 40, 1 << 16)]
 )
 def test_an_estimator_gets_fewer_pixels_at_once_if_each_has_many_numbers(near, n_lights, most):

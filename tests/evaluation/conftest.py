@@ -5,9 +5,8 @@ squares is exact.
 import numpy as np
 import pytest
 
-from scenes import shade, spiral_lights, write_capture
+from scenes import on_sphere, shade, spiral_lights, write_capture
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
-from splinecli.maths.normals import unit
 
 SIZE = 12  # pixels a side; the outermost ring is outside the mask
 
@@ -15,7 +14,7 @@ SIZE = 12  # pixels a side; the outermost ring is outside the mask
 def dome_normals():
     """(SIZE, SIZE, 3) up to 35 degrees from the view axis: less than 90 from every light."""
     y, x = 0.4 * np.mgrid[1 : -1 : SIZE * 1j, -1 : 1 : SIZE * 1j]
-    return unit(np.stack([x, y, np.sqrt(1 - x**2 - y**2)], axis=2))
+    return on_sphere(x, y)
 
 
 def evaluation_of(maes_deg, n_lights=10, *, seconds=1.0, skipped=(), **protocol):
@@ -36,9 +35,7 @@ def write_dome(tmp_path):
 
     def write(name="dome", *, n_lights=8, ground_truth=True, without_truth=0):
         lights, normals = spiral_lights(n_lights, 40, 15), dome_normals()
-        photographs = np.rint(0.9 * 65535 * np.moveaxis(shade(normals, lights), 2, 0)).astype(
-            np.uint16
-        )
+        photographs = np.uint16(np.rint(0.9 * 65535 * np.moveaxis(shade(normals, lights), 2, 0)))
         mask = np.pad(np.ones((SIZE - 2, SIZE - 2), bool), 1)
         normals[1, 1 : 1 + without_truth] = 0
         truth = normals if ground_truth else None

@@ -6,8 +6,19 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.random import default_rng
 
-from scenes import evaluate, put, shade, sphere_cap, spiral_lights, write_capture
+from scenes import (
+    evaluate,
+    parametrize,
+    put,
+    refuses,
+    shade,
+    sphere_cap,
+    spiral_lights,
+    vectors,
+    write_capture,
+)
 from splinecli.capture import open_capture
 from splinecli.errors import InputError, UsageError
 from splinecli.estimate.inference import estimate_normals
@@ -24,7 +35,7 @@ from splinecli.records.white_level import WhiteLevel
 
 
 def random_lights(n_lights, seed=0):
-    lights = np.random.default_rng(seed).normal(size=(n_lights, 3))
+    lights = default_rng(seed).normal(size=(n_lights, 3))
     lights[:, 2] = np.abs(lights[:, 2]) + 0.2
     return unit(lights)
 
@@ -63,14 +74,14 @@ def test_every_light_is_equally_likely():
     assert np.abs(counts - trials * share).max() < 4.5 * np.sqrt(trials * share * (1 - share))
 
 
-@pytest.mark.parametrize("n_lights", [None, 96])
+@parametrize("n_lights", [None, 96])
 def test_all_lights_are_one_draw(n_lights):
     assert draw_lights(LIGHTS, n_lights, trials=100, seed=3) == [tuple(range(96))]
 
 
 def test_lights_in_one_plane_are_drawn_again():
     """Of five lights the first four lie in the plane y = 0: a draw of three needs the fifth."""
-    flat = unit(np.array([[-0.5, 0, 1], [0.2, 0, 1], [0.5, 0, 1], [0.9, 0, 1], [0, 0.5, 1]]))
+    flat = unit(vectors("-0.5 0 1; 0.2 0 1; 0.5 0 1; 0.9 0 1; 0 0.5 1"))
     draws = draw_lights(flat, 3, trials=100, seed=0)
     assert all(4 in draw for draw in draws)
     assert len(set(draws)) == 6  # all pairs of the four
@@ -79,9 +90,9 @@ def test_lights_in_one_plane_are_drawn_again():
     assert draws[:10] == draw_lights(flat, 3, trials=10, seed=0)
 
 
-@pytest.mark.parametrize("name, value", [("trials", 0), ("seed", -1)])
+@parametrize("name, value", [("trials", 0), ("seed", -1)])
 def test_what_cannot_be_drawn(name, value):
-    with pytest.raises(UsageError, match=f"--{name} is {value}; expected"):
+    with refuses(f"--{name} is {value}; expected", UsageError):
         draw_lights(LIGHTS, n_lights=10, **{name: value})
 
 
@@ -89,11 +100,9 @@ def test_a_draws_file(tmp_path):
     file = read_draws(
         put(tmp_path / "draws.txt", "# ours\n0 3 5\n\n 95,1,  2  # in any order\n7\t8;9")
     )
-    assert (file.draws, file.lines, file.n_lights) == (
-        ((0, 3, 5), (95, 1, 2), (7, 8, 9)),
-        (2, 4, 5),
-        3,
-    )
+    assert file.draws == ((0, 3, 5), (95, 1, 2), (7, 8, 9))
+    assert file.lines == (2, 4, 5)
+    assert file.n_lights == 3
     file.check_against(LIGHTS)
 
 
@@ -102,21 +111,18 @@ def test_a_long_draw_is_read(tmp_path):
     assert read_draws(path).n_lights == 40_000
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "text, problem",
-    [
-        ("0 1 2\n0 x 2", ':2: found "x", expected a light index from 0.'),
-        ("0 1 2\n\n0 -1 2", ':3: found "-1", expected a light index from 0.'),
-        ("0 1.5 2", ':1: found "1.5", expected a light index from 0.'),
-        ("0 1 9999999999", ':1: found "9999999999", expected a light index from 0.'),
-        ("0 1 2\n4 5 4", ":2: light index 4 is listed twice. List each light once."),
-        ("# two\n0 1", ":2: found 2 light indices, expected at least 3."),
-        ("0 1 2\n0 1 2 3", ":2: found 4 light indices, expected 3 as in the first draw."),
-        (
-            "# nothing\n",
-            ": the file contains no draws, expected one line of light indices for each.",
-        ),
-    ],
+    r"""
+0 1 2\n0 x 2 | :2: found "x", expected a light index from 0.
+0 1 2\n\n0 -1 2 | :3: found "-1", expected a light index from 0.
+0 1.5 2 | :1: found "1.5", expected a light index from 0.
+0 1 9999999999 | :1: found "9999999999", expected a light index from 0.
+0 1 2\n4 5 4 | :2: light index 4 is listed twice. List each light once.
+# two\n0 1 | :2: found 2 light indices, expected at least 3.
+0 1 2\n0 1 2 3 | :2: found 4 light indices, expected 3 as in the first draw.
+# nothing\n | : the file contains no draws, expected one line of light indices for each.
+""",
 )
 def test_a_wrong_draws_file(tmp_path, text, problem):
     path = put(tmp_path / "draws.txt", text)
@@ -135,7 +141,7 @@ def folder(tmp_path):
     dark for that.
     """
     normals, lights = sphere_cap(SIDE), spiral_lights(N_LIGHTS, 50)
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     albedo = rng.uniform(0.6, 1, (SIDE, SIDE, 1))
     intensities = np.where(np.arange(N_LIGHTS) < CLIPPED, 1.6, 0.5)
     values = (
@@ -145,7 +151,7 @@ def folder(tmp_path):
         * shade(normals, lights)
         * rng.normal(1, 0.01, (SIDE, SIDE, N_LIGHTS))
     )
-    images = np.moveaxis(np.minimum(np.rint(values), LEVEL).astype(np.uint16), 2, 0)
+    images = np.moveaxis(np.uint16(np.minimum(np.rint(values), LEVEL)), 2, 0)
     assert ((images == LEVEL).any(axis=(1, 2)) == (np.arange(N_LIGHTS) < CLIPPED)).all()
     colours = np.repeat(intensities[:, None], 3, axis=1)
     return write_capture(tmp_path / "half", images, lights, normals=normals, intensities=colours)
@@ -167,7 +173,7 @@ def test_each_trial_scores_what_infer_computes_from_its_lights(folder):
     assert any(abs(mae_deg(folder, d) - mae_deg(folder, d, as_stored=True)) > 0.1 for d in draws)
 
 
-@pytest.mark.parametrize("max_pixels", [None, 200])
+@parametrize("max_pixels", [None, 200])
 def test_the_number_of_trials_does_not_change_a_trial(folder, max_pixels):
     def maes_deg(trials, store):
         protocol = Protocol(5, trials=trials, seed=1, max_pixels=max_pixels)
@@ -187,7 +193,8 @@ def test_a_part_of_the_images_and_pixels_keeps_the_level_of_its_images(folder):
     stored = observed(folder)
     assert stored.made.white_level == WhiteLevel(LEVEL, "images")
     dim = stored.choose_images([1, 4, 5, 6, 8])
-    assert (dim.made.white_level, dim.saturated.flags) == (WhiteLevel(65_535, "full scale"), None)
+    assert dim.made.white_level == WhiteLevel(65_535, "full scale")
+    assert dim.saturated.flags is None
     rows = np.arange(0, SIDE * SIDE, 7)
     bright = stored.choose_images([2, 4, 0, 1]).choose_pixels(rows).choose_pixels(np.arange(5, 300))
     alone = observed(folder, [2, 4, 0, 1])

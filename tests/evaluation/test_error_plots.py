@@ -1,10 +1,9 @@
 """Plots decode, have the size their panels need, and carry each method's colour."""
 
 import numpy as np
-import pytest
 
 from evaluation.conftest import evaluation_of
-from scenes import decode_rgb
+from scenes import decode_rgb, parametrize
 from splinecli.evaluation.figures import light_noise_curves, lights_curves
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 from splinecli.pictures.plots import method_styles
@@ -27,7 +26,7 @@ def share_of(colour, picture):
     return float((np.abs(picture.astype(int) - rgb).max(axis=2) <= 2).mean())
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "captures, across, down",
     [
         (["ball"], 1, 1),

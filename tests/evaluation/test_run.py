@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx
 
-from scenes import evaluate, read_image, write_image
+from scenes import evaluate, parametrize, put, read_image, refuses, write_image
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.estimate.methods import Estimator, make_estimator
 from splinecli.evaluation.protocol import Protocol
@@ -31,7 +31,7 @@ class Fake(Estimator):
         self.name, self.lights, self.observations = name, list[Any](), list[Any]()
         capture = read_capture(folder)
         truth = capture.ground_truth[capture.mask]
-        self._truth = truth[truth.any(axis=1)].astype(np.float64)
+        self._truth = np.float64(truth[truth.any(axis=1)])
         self._angles = np.radians(angles_deg)
 
     def estimate(self, observations, lights, *, progress=None):
@@ -59,9 +59,9 @@ def test_mean_and_deviation_over_trials(write_dome):
     folder = write_dome()
     fake = Fake(folder, angles_deg=(1, 3, 5))
     (result,) = evaluate([folder], [fake], Protocol(n_lights=5, trials=3)).results
-    assert result.maes_deg == pytest.approx((1, 3, 5), abs=1e-4)
-    assert result.mae_deg == pytest.approx(3, abs=1e-4)
-    assert result.std_deg == pytest.approx(np.sqrt((4 + 0 + 4) / 3), abs=1e-4)
+    assert result.maes_deg == approx((1, 3, 5), abs=1e-4)
+    assert result.mae_deg == approx(3, abs=1e-4)
+    assert result.std_deg == approx(np.sqrt((4 + 0 + 4) / 3), abs=1e-4)
 
 
 def test_all_methods_and_captures_see_the_same_draws(write_dome):
@@ -78,20 +78,21 @@ def test_all_methods_and_captures_see_the_same_draws(write_dome):
 
 def test_a_draws_file_goes_before_random_draws(write_dome, tmp_path):
     folder = write_dome()
-    (tmp_path / "draws.txt").write_text("5 0 1\n2 3 7\n")
+    put(tmp_path / "draws.txt", "5 0 1\n2 3 7\n")
     fake, whole = Fake(folder), read_capture(folder)
     evaluation = evaluate([folder], [fake], Protocol(trials=99, draws_file=tmp_path / "draws.txt"))
-    assert (evaluation.protocol.n_lights, evaluation.protocol.trials) == (3, 2)
-    assert (evaluation.results[0].n_lights, evaluation.results[0].trials) == (3, 2)
+    assert evaluation.protocol.n_lights == 3
+    assert evaluation.protocol.trials == 2
+    assert evaluation.results[0].n_lights == 3
+    assert evaluation.results[0].trials == 2
     assert_array_equal(fake.observations[0], whole.observations[:, [5, 0, 1]])
     assert_array_equal(fake.lights[1], whole.light_directions[[2, 3, 7]])
 
 
 def test_a_draws_file_that_does_not_fit_a_capture(write_dome, tmp_path):
-    (tmp_path / "draws.txt").write_text("0 1 2\n0 1 9\n")
+    put(tmp_path / "draws.txt", "0 1 2\n0 1 9\n")
     folders = [write_dome("eight"), write_dome("ten", n_lights=10)]
-    protocol = Protocol(draws_file=tmp_path / "draws.txt")
-    evaluation = evaluate(folders, LS, protocol)
+    evaluation = evaluate(folders, LS, Protocol(draws_file=tmp_path / "draws.txt"))
     assert evaluation.captures == ("ten",)
     problem = (
         f"{tmp_path}/draws.txt:2: found light index 9, expected 0 to 7, because the capture has 8"
@@ -111,7 +112,7 @@ def test_light_noise_costs_least_squares_its_exactness(write_dome):
     assert len(set(errors[1].maes_deg)) == 20
     assert errors[0].mae_deg < 0.02 < 0.2 < errors[1].mae_deg
     # The trials' noise is the same but for its size, and small errors grow in proportion.
-    assert errors[2].mae_deg == pytest.approx(4 * errors[1].mae_deg, rel=0.1)
+    assert errors[2].mae_deg == approx(4 * errors[1].mae_deg, rel=0.1)
 
 
 def test_captures_that_cannot_be_scored_are_skipped(write_dome, tmp_path):
@@ -152,7 +153,7 @@ def test_nothing_scored_is_an_error(write_dome, tmp_path):
         ([untrue], InputError, "untrue: the capture has no ground truth"),
         ([few], UsageError, "the capture has only 4 lights, but --n-lights is 5"),
     ):
-        with pytest.raises(error, match=message):
+        with refuses(message, error):
             evaluate(folders, LS, Protocol(n_lights=5))
 
 
@@ -163,11 +164,9 @@ def test_names_tell_captures_apart(write_dome, monkeypatch):
     assert evaluate([Path(), folders[1], folders[2]], LS, Protocol()).captures == ("dome", "bowl")
 
 
-@pytest.mark.parametrize("vector", [(0, 0, 0), (0, 0, np.nan), (0, 0, 0.5)])
+@parametrize("vector", [(0, 0, 0), (0, 0, np.nan), (0, 0, 0.5)])
 def test_normals_that_are_none_are_not_scored(write_dome, vector):
-    with pytest.raises(
-        SplinecliError, match="method constant gave normals that are not unit vectors"
-    ):
+    with refuses("method constant gave normals that are not unit vectors", SplinecliError):
         evaluate([write_dome()], [Constant(vector)], Protocol())
 
 
@@ -178,7 +177,7 @@ def test_progress(write_dome):
     evaluate_all(folders, LS, protocols, on_progress=lambda share, note: seen.append((share, note)))
     shares, notes = zip(*seen, strict=True)
     assert min(shares) == 0
-    assert sum(shares) == pytest.approx(1)
+    assert sum(shares) == approx(1)
     assert [note for note in notes if "reading b" in note] == [
         f"reading b, image {i} of 8" for i in range(1, 9)
     ]
@@ -195,7 +194,7 @@ def test_trials_at_a_time_change_nothing(write_dome):
         assert [(r.method, r.capture) for r in before.results] == [
             (r.method, r.capture) for r in after.results
         ]
-        np.testing.assert_allclose(
+        assert_allclose(
             [r.maes_deg for r in after.results], [r.maes_deg for r in before.results], atol=1e-5
         )
 
@@ -210,30 +209,22 @@ def test_one_that_was_cut_off_goes_on(write_dome, tmp_path):
     scored((1, 2), 2)
     lines = path.read_text().splitlines(keepends=True)
     # Killed while it wrote the second line.
-    path.write_text(lines[0] + lines[1][: len(lines[1]) // 2])
+    put(path, lines[0] + lines[1][: len(lines[1]) // 2])
     evaluation, again = scored((5, 6, 7), 4)
-    assert evaluation.results[0].maes_deg == pytest.approx((1, 5, 6, 7), abs=1e-4)
+    assert evaluation.results[0].maes_deg == approx((1, 5, 6, 7), abs=1e-4)
     assert len(again.lights) == 3
     # Nothing is left to do, and nothing of the first run's was lost.
     same, idle = scored((90,), 4)
-    assert (same, idle.lights) == (evaluation, [])
+    assert same == evaluation
+    assert idle.lights == []
     fresh, _ = scored((90,), 4, fresh=True)
-    assert fresh.results[0].mae_deg == pytest.approx(90, abs=1e-4)
+    assert fresh.results[0].mae_deg == approx(90, abs=1e-4)
     assert len(path.read_text().splitlines()) == 4
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "change",
-    [
-        "photograph",
-        "lights",
-        "method",
-        "seed",
-        "max_pixels",
-        "light_noise_deg",
-        "n_lights",
-        "as_stored",
-    ],
+    "photograph lights method seed max_pixels light_noise_deg n_lights as_stored",
 )
 def test_a_trial_of_something_else_does_not_count(write_dome, tmp_path, change):
     folder, path = write_dome(), tmp_path / "trials.jsonl"
@@ -245,7 +236,7 @@ def test_a_trial_of_something_else_does_not_count(write_dome, tmp_path, change):
         write_image(folder / "003.png", read_image(folder / "003.png")[::-1].copy())
     elif change == "lights":
         lights = folder / "light_directions.txt"
-        lights.write_text(lights.read_text() + "\n")
+        put(lights, lights.read_text() + "\n")
     elif change == "method":
         fake.fingerprint = "other weights"
     else:
@@ -307,6 +298,6 @@ def test_draws_keep_to_the_images_that_are_not_left_out(write_dome, tmp_path):
     lights = read_capture(folder).light_directions
     seen = {tuple(light) for draw in fake.lights for light in draw}
     assert seen == {tuple(light) for light in lights[3:]}
-    (tmp_path / "draws.txt").write_text("3 4 5\n2 4 5\n")
-    with pytest.raises(InputError, match=r"draws\.txt:2: found light index 2, but the first 3"):
+    put(tmp_path / "draws.txt", "3 4 5\n2 4 5\n")
+    with refuses(r"draws\.txt:2: found light index 2, but the first 3"):
         evaluate([folder], [fake], Protocol(draws_file=tmp_path / "draws.txt", skip_first={"*": 3}))

@@ -11,10 +11,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
+from pytest import approx
 from scipy import stats
 
 from evaluation.conftest import evaluation_of
+from scenes import parametrize
 from splinecli.evaluation.document import html_report, results_csv, results_document
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 from splinecli.evaluation.tables import (
@@ -75,7 +76,7 @@ def test_rows_for_a_terminal():
     assert best_cells(rows) == {(2, 1), (1, 2), (2, 2), (2, 3)}
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "name, shown",
     [
         ("a|b", r"a\|b"),
@@ -101,7 +102,7 @@ def test_light_noise_tells_evaluations_apart():
     assert "## 10 lights, light noise of 2.5 degrees\n" in markdown([TEN, noisy])
 
 
-@pytest.mark.parametrize("as_stored", [False, True])
+@parametrize("as_stored", [False, True])
 def test_every_document_names_how_the_captures_were_read(as_stored):
     evaluation = replace(TEN, protocol=replace(TEN.protocol, as_stored=as_stored))
     words = "images as stored." if as_stored else "images restored."
@@ -140,21 +141,23 @@ SECOND = (1.9, 0.8, 1.1, 0.1, -0.1, 4.4, 5.5, 1.6, 4.6, 3.4)
 def test_students_example():
     comparison, average = compare(evaluation_of({"ball": {"ls": FIRST, "iw12": SECOND}}))
     # As R's t.test(extra ~ group, paired = TRUE) prints it.
-    assert comparison.p_value == pytest.approx(0.002833, abs=5e-7)
-    assert comparison.interval_deg == pytest.approx((-2.4598858, -0.7001142), abs=5e-8)
-    assert comparison.difference_deg == pytest.approx(-1.58)
+    assert comparison.p_value == approx(0.002833, abs=5e-7)
+    assert comparison.interval_deg == approx((-2.4598858, -0.7001142), abs=5e-8)
+    assert comparison.difference_deg == approx(-1.58)
     # squares about the mean, by hand
-    assert comparison.std_deg == pytest.approx(np.sqrt(13.616 / 10))
-    assert (comparison.first, comparison.second, comparison.trials) == ("ls", "iw12", 10)
+    assert comparison.std_deg == approx(np.sqrt(13.616 / 10))
+    assert comparison.first == "ls"
+    assert comparison.second == "iw12"
+    assert comparison.trials == 10
     assert comparison.p_holm == comparison.p_value  # one pair
     assert comparison.differs
     assert average.capture == AVERAGE
-    assert average.p_value == pytest.approx(comparison.p_value)
+    assert average.p_value == approx(comparison.p_value)
 
 
 def test_holm_by_hand():
     # m = 4: 0.01 * 4; 0.03 * 3 = 0.09; 0.04 * 2 = 0.08, held up by 0.09; 0.9 * 1.
-    assert holm([0.04, 0.01, 0.9, 0.03]) == pytest.approx([0.09, 0.04, 0.9, 0.09])
+    assert holm([0.04, 0.01, 0.9, 0.03]) == approx([0.09, 0.04, 0.9, 0.09])
     assert holm([0.6, 0.7]) == [1.0, 1.0]
     assert holm([]) == []
 
@@ -180,14 +183,14 @@ def test_every_pair_on_every_capture_and_on_their_average():
             np.mean([methods[m] for methods in captures], axis=0) for m in (c.first, c.second)
         )
         oracle = stats.ttest_rel(first, second)
-        assert c.p_value == pytest.approx(oracle.pvalue)
-        assert c.interval_deg == pytest.approx(tuple(oracle.confidence_interval(0.95)))
+        assert c.p_value == approx(oracle.pvalue)
+        assert c.interval_deg == approx(tuple(oracle.confidence_interval(0.95)))
     for capture in ("ball", AVERAGE):
         of_one = [c for c in comparisons if c.capture == capture]
-        assert [c.p_holm for c in of_one] == pytest.approx(holm([c.p_value or 0 for c in of_one]))
+        assert [c.p_holm for c in of_one] == approx(holm([c.p_value or 0 for c in of_one]))
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "first, second, interval, p_value, differs",
     [
         ((4.0,), (5.0,), None, None, None),  # one trial
@@ -210,9 +213,7 @@ def test_pairs_without_a_test_do_not_count_in_the_correction():
     on_ball = {(c.first, c.second): c for c in comparisons if c.capture == "ball"}
     assert on_ball["a", "c"].p_holm is None
     tested = [on_ball["a", "b"], on_ball["b", "c"]]
-    assert [each.p_holm for each in tested] == pytest.approx(
-        holm([each.p_value for each in tested])
-    )
+    assert [each.p_holm for each in tested] == approx(holm([each.p_value for each in tested]))
 
 
 def test_the_average_takes_the_trials_all_captures_have():

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from scenes import assert_unit, vectors
 from splinecli.capture import Capture
 from splinecli.evaluation.trials import scored_rows, tilt_lights
 from splinecli.maths.normals import angle_between_deg, unit
 
-LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
+LIGHTS = vectors("0 0 1; 0.6 0 0.8; 0 0.6 0.8")
 MASK = np.random.default_rng(5).random((9, 7)) < 0.7
 
 
@@ -47,18 +48,18 @@ def test_a_part_of_the_pixels(capture):
     assert (parts[0] != parts[2]).any()
 
 
-def test_angles_have_the_wanted_root_mean_square():
+def test_angles_have_the_wanted_root_mean_square(rng):
     lights = np.tile(unit(np.array([[0.3, -0.4, 1.0]])), (20_000, 1))
-    tilted = tilt_lights(lights, 4.0, np.random.default_rng(0))
+    tilted = tilt_lights(lights, 4.0, rng)
     angles = angle_between_deg(tilted, lights)
     # The standard error of the root mean square of n Gaussians is sigma / sqrt(2 n) = 0.02.
     assert np.sqrt((angles**2).mean()) == pytest.approx(4.0, abs=0.08)
     # No direction is preferred: the mean is the light, shortened by the mean cosine.
     assert angle_between_deg(unit(tilted.mean(axis=0)), lights[0]) < 0.15
-    np.testing.assert_allclose(np.linalg.norm(tilted, axis=1), 1)
+    assert_unit(tilted)
 
 
-def test_lights_stay_above_the_horizon():
+def test_lights_stay_above_the_horizon(rng):
     azimuth = np.linspace(0, 2 * np.pi, 5000)
     lights = unit(np.stack([np.cos(azimuth), np.sin(azimuth), np.full(5000, 0.001)], axis=1))
-    assert (tilt_lights(lights, 30.0, np.random.default_rng(0))[:, 2] > 0).all()
+    assert (tilt_lights(lights, 30.0, rng)[:, 2] > 0).all()

@@ -20,7 +20,6 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -78,7 +77,7 @@ REPLACEMENTS = {
 class KilledCommand:
     """A replacement, ready to be killed again and again."""
 
-    def __init__(self, name: str, work: Path) -> None:
+    def __init__(self, name, work):
         """Write the input, and run both commands undisturbed."""
         from corpus import TARGETS
 
@@ -99,7 +98,7 @@ class KilledCommand:
         self.old, self.new = self._state(self.start), self._state(self.case)
         self.kill_count = self.new_count = 0
 
-    def kill(self, step: int | None = None, seconds: float | None = None) -> Iterator[str]:
+    def kill(self, step=None, seconds=None):
         """Kill the command at a step or after some time, and yield what is wrong afterwards."""
         from splinecli.system.publishing import held_folder
 
@@ -135,12 +134,12 @@ class KilledCommand:
         if after != self.new:
             yield "the next run ends with other files"
 
-    def missing_syncs(self) -> Iterator[str]:
+    def missing_syncs(self):
         """Yield what an undisturbed run renames before it is on the disk."""
         self._reset()
         yield from missing_syncs(record_calls(self._run_again), self.replacement.report)
 
-    def count_steps(self) -> int:
+    def count_steps(self):
         """Return the number of changes of files in an undisturbed run."""
         self._reset()
         reader, writer = os.pipe()
@@ -148,7 +147,7 @@ class KilledCommand:
         if child == 0:
             count = 0
 
-            def counted(event: str, args: tuple[object, ...]) -> None:
+            def counted(event, args):
                 nonlocal count
                 count += changes_files(event, args)
 
@@ -162,7 +161,7 @@ class KilledCommand:
         os.close(reader)
         return count
 
-    def _problems(self, state: dict[str, bytes]) -> Iterator[str]:
+    def _problems(self, state):
         """Yield what is wrong with the files after a kill."""
         if self.replacement.folder == "out/set" and b'"complete": false' in state.get(
             "set/manifest.json", b""
@@ -181,17 +180,17 @@ class KilledCommand:
         if report in state and not any(whole.items() <= state.items() for whole in wholes):
             yield f"a report of a mixture of {sorted(state)}"
 
-    def _reset(self) -> None:
+    def _reset(self):
         shutil.rmtree(self.case, ignore_errors=True)
         shutil.copytree(self.start, self.case)
 
-    def _run_again(self) -> float:
+    def _run_again(self):
         started = time.monotonic()
         command = self.replacement.new
         assert run_warm(self.case, command) == 0, command
         return time.monotonic() - started
 
-    def _state(self, folder: Path) -> dict[str, bytes]:
+    def _state(self, folder):
         """Return the content of the output by name, without what differs from run to run, such as
         times and memory.
         """
@@ -204,7 +203,7 @@ class KilledCommand:
         return {name: _MEASURED.sub(rb"\1", value) for name, value in files.items()}
 
 
-def main() -> int:
+def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

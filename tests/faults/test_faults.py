@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from kills import content
-from scenes import write_capture, write_image
+from scenes import parametrize, refuses, run_python, shell, vectors, write_capture, write_image
 from splinecli.cli.main import main
-from splinecli.errors import InputError
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.maths.normals import unit
 from splinecli.pipeline.infer import infer_capture
@@ -26,20 +26,14 @@ pytestmark = pytest.mark.skipif(
 )
 
 COMMAND = f"{sys.executable} -m splinecli"
-LIGHTS = unit(np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1)], float))
-
-
-def shell(script, folder):
-    return subprocess.run(
-        ["bash", "-c", script], cwd=folder, capture_output=True, text=True, timeout=120
-    )
+LIGHTS = unit(vectors("0 0 1; 0.5 0 1; -0.5 0 1; 0 0.5 1; 0.1 -0.5 1"))
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A folder with a flat capture of 60 x 60 pixels and the results of an earlier run in `out`."""
-    noise = np.random.default_rng(0).integers(0, 2000, (len(LIGHTS), 60, 60))
-    images = (50_000 * LIGHTS[:, 2, None, None] + noise).astype(np.uint16)
+    noise = default_rng(0).integers(0, 2000, (len(LIGHTS), 60, 60))
+    images = np.uint16(50_000 * LIGHTS[:, 2, None, None] + noise)
     write_capture(tmp_path / "a", images, LIGHTS, names="{}.png")
     monkeypatch.chdir(tmp_path)
     assert main(["infer", "a", "--method", "ls", "-q"]) == 0
@@ -47,22 +41,15 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_kills_of_every_command():
-    script = [
-        sys.executable,
-        str(Path(__file__).with_name("kill_commands.py")),
-        "--steps",
-        "2",
-        "--kills",
-        "7",
-    ]
-    done = subprocess.run(script, capture_output=True, text=True)
+    script = Path(__file__).with_name("kill_commands.py")
+    done = shell(f"{sys.executable} {script} --steps 2 --kills 7")
     assert done.returncode == 0, done.stdout + done.stderr
     for command in ("infer", "calibrate", "integrate", "evaluate", "prepare", "info", "train"):
         assert f"{command}: " in done.stdout
     assert "0 failed" in done.stdout
 
 
-@pytest.mark.parametrize("disk_kb", [16, 128])
+@parametrize("disk_kb", [16, 128])
 def test_a_full_disk_leaves_what_was_there(folder, disk_kb):
     """The disk has room for no results; or for one set, and is filled after it."""
     mount = f"mount -t tmpfs -o size={disk_kb}k tiny disk"
@@ -72,7 +59,7 @@ def test_a_full_disk_leaves_what_was_there(folder, disk_kb):
         f"mkdir disk; {mount} || exit 77; cp a/light_directions.txt disk/kept; "
         f"{fill if disk_kb == 128 else ''} {infer}; echo $? >code; rm -f disk/fill; cp -r disk left"
     )
-    done = shell(f"unshare --map-root-user --mount bash -c '{script}'", folder)
+    done = shell(f"unshare --map-root-user --mount bash -c '{script}'", cwd=folder)
     if done.returncode or not (folder / "code").exists():
         pytest.skip(f"this system does not let the test mount a disk ({done.stderr.strip()})")
     assert (folder / "code").read_text() == "5\n"
@@ -92,7 +79,7 @@ def large(tmp_path_factory):
     """A capture of 1.2 megapixels, whose reading takes long enough to be interrupted."""
     folder = tmp_path_factory.mktemp("large")
     lights = np.tile(LIGHTS, (4, 1))
-    noise = np.random.default_rng(0).integers(0, 20_000, (1000, 1200), np.uint16)
+    noise = default_rng(0).integers(0, 20_000, (1000, 1200), np.uint16)
     write_image(folder / "00.png", noise)
     for number in range(1, len(lights)):
         os.link(folder / "00.png", folder / f"{number:02d}.png")
@@ -133,9 +120,7 @@ def test_too_little_memory_for_the_results(folder, monkeypatch):
     )
     options = InferOptions(method="ls", maps=("albedo",), output=str(folder / "out"))
     monkeypatch.setattr(LeastSquares, "estimate", None)
-    with pytest.raises(
-        InputError, match=r"the results of 3600 pixels take 1000000\.0 GB of memory"
-    ) as caught:
+    with refuses(r"the results of 3600 pixels take 1000000\.0 GB of memory") as caught:
         infer_capture(folder / "a", options)
     assert (
         caught.value.hint == "Mask the object, or use --scale or --crop, or leave out --maps albedo"
@@ -145,7 +130,9 @@ def test_too_little_memory_for_the_results(folder, monkeypatch):
 
 def test_a_limit_on_the_size_of_files_keeps_earlier_results(folder):
     before = content(folder / "out")
-    done = shell(f"ulimit -f 4; trap '' XFSZ; {COMMAND} infer a --method ls --overwrite -q", folder)
+    done = shell(
+        f"ulimit -f 4; trap '' XFSZ; {COMMAND} infer a --method ls --overwrite -q", cwd=folder
+    )
     assert (done.returncode, done.stderr.count("\n")) == (5, 1)
     assert content(folder / "out") == before
 
@@ -169,9 +156,7 @@ def test_a_limit_on_open_files(folder):
     """The command is refused with one message as long as the limit is too low, and the next start
     finds results.
     """
-    done = subprocess.run(
-        [sys.executable, "-c", LIMITED], cwd=folder, capture_output=True, text=True
-    )
+    done = run_python(LIMITED, cwd=folder)
     assert done.returncode == 0, done.stderr
     first, *codes = json.loads(done.stdout)
     limited, unlimited = codes[::2], codes[1::2]
@@ -197,8 +182,8 @@ BUSY = (
 
 def test_a_second_writer_is_refused(folder):
     before = content(folder / "out")
-    with held_folder(folder / "out" / "a"):
-        done = shell(f"{COMMAND} infer a --method ls --overwrite -q", folder)
+    with held_folder(folder / "out/a"):
+        done = shell(f"{COMMAND} infer a --method ls --overwrite -q", cwd=folder)
     assert (done.returncode, done.stderr) == (5, BUSY)
     assert content(folder / "out") == before
 
@@ -226,6 +211,6 @@ def test_an_output_folder_without_permission(folder):
     rights = "-dac_override,-dac_read_search"
     prefix = f"setpriv --bounding-set={rights} --inh-caps={rights} " if os.geteuid() == 0 else ""
     for command in ("infer a --method ls", "integrate out/a", "calibrate a --circle 30,30,20"):
-        done = shell(f"{prefix}{COMMAND} {command} -o closed -q", folder)
+        done = shell(f"{prefix}{COMMAND} {command} -o closed -q", cwd=folder)
         assert done.returncode == 5, done.stderr
         assert done.stderr.startswith("splinecli: closed: no permission to write into this folder")

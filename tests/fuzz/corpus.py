@@ -4,22 +4,28 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
-import cv2
 import numpy as np
 import tifffile
 import trimesh
 from PIL import Image, ImageCms
 from scipy.io import savemat
 
-from scenes import write_image
+from scenes import (
+    ball,
+    pinhole,
+    put,
+    shade,
+    spiral_lights,
+    tilted,
+    to_uint16,
+    write_capture,
+    write_image,
+    write_mirror_ball,
+)
 
 SHAPE = (16, 18)
-LIGHTS = np.array(
-    [(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1), (0.4, 0.4, 1)], float
-)
-LIGHTS /= np.linalg.norm(LIGHTS, axis=1, keepdims=True)
+LIGHTS = spiral_lights(6, 30, 0)
 OUT = "out"
 """The folder that commands write into. An earlier run has filled it."""
 
@@ -29,95 +35,84 @@ class Target:
     """A kind of input."""
 
     name: str  # for people, and the name of its folder
-    write: Callable[[Path], None]  # writes its files into an empty folder
-    files: tuple[str, ...]  # patterns of the files that are mutated
-    commands: tuple[str, ...]  # the arguments of each command that reads them
-    earlier: tuple[
-        str, ...
-    ] = ()  # the commands whose output is there before; the first of `commands` if there is none
+    write: Callable  # writes its files into an empty folder
+    patterns: str  # of the files that are mutated
+    lines: str  # the arguments of each command that reads them, a command a line
+    # the commands whose output is there before; the first of `lines` if there is none
+    earlier_lines: str = ""
     grows: bool = False  # whether a command that fails late has already added to the earlier output
 
+    @property
+    def files(self):
+        return self.patterns.split()
 
-def normals() -> np.ndarray:
+    @property
+    def commands(self):
+        return self.lines.strip().splitlines()
+
+    @property
+    def earlier(self):
+        return self.earlier_lines.strip().splitlines() or self.commands[:1]
+
+
+def normals():
     """Normals (H, W, 3) of a flat sphere."""
     y, x = np.indices(SHAPE)
-    vectors = np.stack(((x - 8.5) / 9, (7.5 - y) / 8, np.full(SHAPE, 2.5)), axis=-1)
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return tilted((x - 8.5) / 22.5, (7.5 - y) / 20)
 
 
-def shaded(light: np.ndarray) -> np.ndarray:
-    return np.rint((normals() @ light).clip(0) * 50_000).astype(np.uint16)
+PICTURES = to_uint16(np.moveaxis(shade(normals(), LIGHTS), 2, 0) * 50_000)
+GRAY = (PICTURES // 257).astype(np.uint8)
 
 
-def png_capture(folder: Path) -> None:
+def png_capture(folder):
     """DiLiGenT's layout, with every optional file."""
-    names = [f"{number:03}.png" for number in range(len(LIGHTS))]
-    for name, light in zip(names, LIGHTS, strict=True):
-        write_image(folder / name, shaded(light))
-    (folder / "filenames.txt").write_text("\n".join(names) + "\n")
-    np.savetxt(folder / "light_directions.txt", LIGHTS)
-    np.savetxt(folder / "light_intensities.txt", np.ones((len(LIGHTS), 3)))
-    cv2.imwrite(
-        str(folder / "mask.png"), (np.indices(SHAPE).sum(axis=0) > 3).astype(np.uint8) * 255
-    )
+    mask = np.indices(SHAPE).sum(axis=0) > 3
+    write_capture(folder, PICTURES, LIGHTS, mask=mask, intensities=np.ones((len(LIGHTS), 3)))
+    put(folder / "filenames.txt", "".join(f"{number:03}.png\n" for number in range(len(LIGHTS))))
     write_image(folder / "ambient.png", np.full(SHAPE, 20, np.uint16))
     savemat(folder / "Normal_gt.mat", {"Normal_gt": normals()}, do_compression=True)
 
 
-def jpeg_capture(folder: Path) -> None:
-    for number, light in enumerate(LIGHTS):
-        gray = (shaded(light) // 257).astype(np.uint8)
-        write_image(folder / f"{number}.jpg", np.dstack([gray] * 3))
+def jpeg_capture(folder):
+    write_capture(folder, np.repeat(GRAY[..., None], 3, axis=3), None, names="{}.jpg")
     lines = [f"C:\\rti\\{n}.jpg {x} {y} {z}" for n, (x, y, z) in enumerate(LIGHTS)]
-    (folder / "rti.lp").write_text("\n".join([str(len(LIGHTS)), *lines]))
-    alpha = np.dstack(
-        [np.full(SHAPE, 200, np.uint8)] * 3 + [np.tri(*SHAPE, k=8, dtype=np.uint8) * 255]
-    )
-    write_image(folder / "mask.png", alpha)
-    np.save(folder / "normal_gt.npy", normals().astype(np.float32))
+    put(folder / "rti.lp", "\n".join([str(len(LIGHTS)), *lines]))
+    alpha = np.dstack([np.full(SHAPE, 200)] * 3 + [np.tri(*SHAPE, k=8) * 255])
+    write_image(folder / "mask.png", np.uint8(alpha))
+    np.save(folder / "normal_gt.npy", np.float32(normals()))
 
 
-def tiff_capture(folder: Path) -> None:
-    for number, light in enumerate(LIGHTS):
-        value = shaded(light)
-        compression = (None, "zlib", "zlib", None, None, None)[number]
+def tiff_capture(folder):
+    for number, value in enumerate(PICTURES):
+        path, rgb = folder / f"{number}.tif", np.dstack([value] * 3)
         if number == 3:
-            tifffile.imwrite(folder / "3.tif", value.astype(np.float32) / 65_535)
+            tifffile.imwrite(path, np.float32(value) / 65_535)
         elif number == 4:
-            write_image(folder / "4.tif", value)  # LZW
+            write_image(path, value)  # LZW
         else:
-            rgb = np.dstack([value] * 3)
-            tifffile.imwrite(
-                folder / f"{number}.tif", rgb, photometric="rgb", compression=compression
-            )
+            packed = "zlib" if number in (1, 2) else None
+            tifffile.imwrite(path, rgb, photometric="rgb", compression=packed)
+    known = {"type": "directional", "intensity": [1.0, 1.0, 1.0]}
     lights = [
-        {
-            "viewId": number,
-            "type": "directional",
-            "direction": [x, -y, -z],
-            "intensity": [1.0, 1.0, 1.0],
-        }
+        {"viewId": number, "direction": [x, -y, -z], **known}
         for number, (x, y, z) in enumerate(LIGHTS)
     ]
-    (folder / "lights.json").write_text(json.dumps({"lights": lights}))
+    put(folder / "lights.json", json.dumps({"lights": lights}))
     np.savetxt(folder / "normal_gt.txt", normals().reshape(-1, 3))
     tifffile.imwrite(folder / "mask.tif", np.full(SHAPE, 255, np.uint8))
-    (folder / "draws.txt").write_text("0 1 2 3\n1 2 3 4\n")
+    put(folder / "draws.txt", "0 1 2 3\n1 2 3 4\n")
 
 
-def pgm_and_stack_captures(folder: Path) -> None:
-    for name in ("pgm", "stack"):
-        (folder / name).mkdir()
-        np.savetxt(folder / name / "lights.txt", LIGHTS)
-    for number, light in enumerate(LIGHTS):
-        write_image(folder / f"pgm/{number}.pgm", shaded(light))
-    pictures = np.stack([shaded(light) for light in LIGHTS])
-    tifffile.imwrite(folder / "stack/stack.tif", pictures, photometric="minisblack")
+def pgm_and_stack_captures(folder):
+    write_capture(folder / "pgm", PICTURES, LIGHTS, names="{}.pgm")
+    write_capture(folder / "stack", [], LIGHTS)
+    tifffile.imwrite(folder / "stack/stack.tif", PICTURES, photometric="minisblack")
 
 
-def mat_captures(folder: Path) -> None:
+def mat_captures(folder):
     """Photographs, mask and lights in one .mat file, and lamps of near_ps."""
-    pictures = np.stack([shaded(light) for light in LIGHTS], axis=-1)
+    pictures = np.moveaxis(PICTURES, 0, -1)
     mask = np.ones(SHAPE, np.uint8)
     for name, arrays in (
         ("array", {"I": pictures, "S": LIGHTS.T, "mask": mask}),
@@ -126,19 +121,16 @@ def mat_captures(folder: Path) -> None:
         (folder / name).mkdir()
         savemat(folder / name / "a.mat", arrays, do_compression=name == "array")
     np.savetxt(folder / "numbered/lights.txt", LIGHTS)
-    (folder / "lamps").mkdir()
-    for number, light in enumerate(LIGHTS):
-        write_image(folder / f"lamps/{number}.png", shaded(light))
+    write_capture(folder / "lamps", PICTURES, None, names="{}.png")
     count = (len(LIGHTS), 1)
     lamps = {"S": 100 * LIGHTS * (1, -1, -1) + (0, 0, 500), "Dir": -LIGHTS * (1, -1, -1)}
     savemat(folder / "lamps/light.mat", lamps | {"mu": np.ones(count), "Phi": np.full(count, 9e3)})
-    savemat(folder / "lamps/camera.mat", {"K": np.array([[500, 0, 9], [0, 500, 8], [0, 0, 1.0]])})
+    savemat(folder / "lamps/camera.mat", {"K": pinhole(500, 9, 8)})
 
 
-def light_files(folder: Path) -> None:
+def light_files(folder):
     """Light files of every form, and near lamps."""
-    for number, light in enumerate(LIGHTS):
-        write_image(folder / f"{number}.png", shaded(light))
+    write_capture(folder, PICTURES, None, names="{}.png")
     azimuth = np.degrees(np.arctan2(LIGHTS[:, 1], LIGHTS[:, 0]))
     np.savetxt(
         folder / "azel.txt",
@@ -147,100 +139,71 @@ def light_files(folder: Path) -> None:
     )
     np.save(folder / "vectors.npy", LIGHTS)
     rows = [" ".join(f"{value:.6f}" for value in light) for light in LIGHTS]
-    (folder / "utf16.txt").write_text("x y z\n" + "\n".join(rows), "utf-16")
-    (folder / "commas.txt").write_text("\n".join(rows).replace(".", ",").replace(" ", ";"))
-    (folder / "named.csv").write_text(
-        "\n".join(f"{number}.png;{row}" for number, row in enumerate(rows))
-    )
-    (folder / "list.json").write_text(json.dumps(LIGHTS.tolist()))
+    put(folder / "utf16.txt", "x y z\n" + "\n".join(rows), "utf-16")
+    put(folder / "commas.txt", "\n".join(rows).replace(".", ",").replace(" ", ";"))
+    put(folder / "named.csv", "\n".join(f"{number}.png;{row}" for number, row in enumerate(rows)))
+    put(folder / "list.json", json.dumps(LIGHTS.tolist()))
     lights = [dict(zip("xyz", light, strict=True)) for light in LIGHTS.tolist()]
     objects = [{"file": f"{n}.png", "light_dir": light} for n, light in enumerate(LIGHTS.tolist())]
-    (folder / "objects.json").write_text(json.dumps({"version": 1, "images": objects}))
-    (folder / "rig.dome").write_text(json.dumps({"directions": lights, "positionsSphere": lights}))
+    put(folder / "objects.json", json.dumps({"version": 1, "images": objects}))
+    put(folder / "rig.dome", json.dumps({"directions": lights, "positionsSphere": lights}))
     np.savetxt(folder / "positions.txt", 60 * LIGHTS)
     np.savetxt(folder / "light_lobes.txt", np.column_stack((-LIGHTS, np.full(len(LIGHTS), 2))))
-    (folder / "camera.txt").write_text("500 0 9\n0 500 8\n0 0 1\n")
+    put(folder / "camera.txt", "500 0 9\n0 500 8\n0 0 1\n")
 
 
-def normal_maps(folder: Path) -> None:
-    cv2.imwrite(
-        str(folder / "n.png"), np.rint((normals()[..., ::-1] + 1) / 2 * 65_535).astype(np.uint16)
-    )
-    tifffile.imwrite(folder / "n.tif", normals().astype(np.float32), photometric="rgb")
+def normal_maps(folder):
+    write_image(folder / "n.png", np.uint16(np.rint((normals()[..., ::-1] + 1) / 2 * 65_535)))
+    tifffile.imwrite(folder / "n.tif", np.float32(normals()), photometric="rgb")
     np.save(folder / "n.npy", normals())
     savemat(folder / "n.mat", {"n": normals()})
     savemat(folder / "packed.mat", {"words": "text", "n": normals()}, do_compression=True)
     write_image(folder / "mask.png", np.full(SHAPE, 255, np.uint8))
     write_image(folder / "colours.jpg", np.full((*SHAPE, 3), 90, np.uint8))
-    (folder / "camera.txt").write_text("500 0 9\n0 500 8\n0 0 1\n")
+    put(folder / "camera.txt", "500 0 9\n0 500 8\n0 0 1\n")
 
 
-def profiles(folder: Path) -> None:
+def profiles(folder):
     """Images with a colour profile, in each format that has one."""
     profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     for ending in ("png", "tif", "jpg"):
-        (folder / ending).mkdir()
-        for number, light in enumerate(LIGHTS[:4]):
-            gray = (shaded(light) // 257).astype(np.uint8)
+        write_capture(folder / ending, [], LIGHTS[:4])
+        for number, gray in enumerate(GRAY[:4]):
             picture = Image.fromarray(np.dstack([gray] * 3))
             picture.save(folder / ending / f"{number}.{ending}", icc_profile=profile)
-        np.savetxt(folder / ending / "light_directions.txt", LIGHTS[:4])
 
 
-def mirror_ball(folder: Path) -> None:
-    y, x = np.indices((40, 50))
-    nx, ny = (x - 25) / 16, (20 - y) / 16
-    inside = nx**2 + ny**2 < 1
-    n = np.stack((nx, ny, np.sqrt(np.where(inside, 1 - nx**2 - ny**2, 0))), axis=-1)
-    (folder / "ball").mkdir()
-    (folder / "gray").mkdir()
-    for number, light in enumerate(LIGHTS[:4]):
-        half = light + np.array((0, 0, 1))
-        spot = np.exp(
-            -((np.degrees(np.arccos((n @ (half / np.linalg.norm(half))).clip(-1, 1))) / 4) ** 2)
-        )
-        ball = np.where(inside, 0.02 + 0.9 * spot, 0.2)
-        gray = np.where(inside, 0.5 * (n @ light).clip(0), 0)
-        for name, picture in (("ball", ball), ("gray", gray)):
-            cv2.imwrite(
-                str(folder / name / f"{number}.png"), np.rint(picture * 65_535).astype(np.uint16)
-            )
-    for name in ("ball", "gray"):
-        write_image(folder / name / "mask.png", inside.astype(np.uint8) * 255)
+def mirror_ball(folder):
+    normals, inside = ball((40, 50), 25, 20, 16)
+    write_mirror_ball(folder / "ball", normals, inside, LIGHTS[:4], width_deg=4)
+    gray = to_uint16(0.5 * np.moveaxis(shade(normals, LIGHTS[:4]), 2, 0) * inside * 65_535)
+    write_capture(folder / "gray", gray, None, mask=inside, names="{}.png")
+    shutil.copy(folder / "gray/mask.png", folder / "ball")
     np.savetxt(folder / "known.txt", LIGHTS[:4])
-    (folder / "camera.txt").write_text("500 0 25\n0 500 20\n0 0 1\n")
+    put(folder / "camera.txt", "500 0 25\n0 500 20\n0 0 1\n")
 
 
-def thin(folder: Path) -> None:
+def thin(folder):
     """Images one pixel wide, and crops of one pixel."""
     for name, shape in (("column", (40, 1)), ("row", (1, 40))):
-        (folder / name).mkdir()
-        for number, light in enumerate(LIGHTS):
-            picture = np.resize(shaded(light), shape)
-            write_image(folder / name / f"{number}.png", picture)
-        np.savetxt(folder / name / "light_directions.txt", LIGHTS)
+        write_capture(folder / name, [np.resize(p, shape) for p in PICTURES], LIGHTS)
 
 
-def meshes(folder: Path) -> None:
+def meshes(folder):
     """A tetrahedron in every format."""
-    corners, faces = (
-        ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)),
-        ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)),
-    )
-    shape = trimesh.Trimesh(corners, faces)
+    shape = trimesh.creation.cone(1, 1, sections=3)
     for ending in ("ply", "obj", "stl", "stl_ascii", "off"):
         shape.export(folder / f"m.{ending}", file_type=ending)
 
 
-def two_captures(folder: Path) -> None:
+def two_captures(folder):
     """Captures whose results are read again: reports, thumbnails, finished trials, pixel sets."""
     for name in ("capture", "second"):
-        (folder / name).mkdir()
         png_capture(folder / name)
     write_settings(folder)
 
 
-def weights(folder: Path) -> None:
+def weights(folder):
     import torch
 
     from splinecli.estimate.networks.config import NetworkConfig
@@ -254,11 +217,10 @@ def weights(folder: Path) -> None:
     save_weights(SplineNet(config), folder / "w.safetensors")
     torch.save({"a": torch.zeros(3)}, folder / "g.ckpt")
     torch.save({"a": torch.zeros(3)}, folder / "old.ckpt", _use_new_zipfile_serialization=False)
-    (folder / "capture").mkdir()
     png_capture(folder / "capture")
 
 
-def training(folder: Path) -> None:
+def training(folder):
     """A finished run, a pixel set, and settings: reading them takes no training step."""
     from small_pixel_sets import matte_pixels
     from splinecli.workshop.pixel_sets.store import PixelSetWriter
@@ -270,167 +232,184 @@ def training(folder: Path) -> None:
     write_settings(folder)
 
 
-def write_settings(folder: Path) -> None:
-    (folder / "a.toml").write_text(
+def write_settings(folder):
+    put(
+        folder / "a.toml",
         "steps = 1\nbatch_size = 4\nseed = 3\nlearning_rate = 1e-3\nschedule ="
         " 'cosine'\nheld_share = 0.0\n[pixels]\nmin_lights = 4\nmax_lights = 6\nusual_lights ="
-        " 5\n[network]\nmap_size = 8\nwidth = 2\nli_blocks = 1\nne_blocks = 1\nhead_width = 4\n"
+        " 5\n[network]\nmap_size = 8\nwidth = 2\nli_blocks = 1\nne_blocks = 1\nhead_width = 4\n",
     )
 
 
-def each(command: str, words: str) -> tuple[str, ...]:
-    """Return the command with each of the words in the place of {}."""
-    return tuple(command.format(word) for word in words.split())
-
-
-TRAIN = "train set -o out/run -q"
+LS = "--method ls -o out --overwrite"
+ON_IMAGES = "--mask mask.png --colours colours.jpg --camera-matrix camera.txt -o out --overwrite"
 TARGETS = (
     Target(
         "png",
         png_capture,
-        ("*",),
-        (
-            "infer . --method ls -o out --overwrite --maps albedo",
-            "info . --plot plots/lights.png --overwrite",
-            "evaluate . --method ls --n-lights 4 --trials 1 -o out --overwrite",
-            "prepare . -o out/set",
-        ),
+        "*",
+        f"""
+infer . {LS} --maps albedo
+info . --plot plots/lights.png --overwrite
+evaluate . --method ls --n-lights 4 --trials 1 -o out --overwrite
+prepare . -o out/set
+""",
     ),
-    Target("jpeg", jpeg_capture, ("*",), ("infer . --method ls -o out --overwrite", "info .")),
+    Target("jpeg", jpeg_capture, "*", f"infer . {LS}\ninfo ."),
     Target(
         "tiff",
         tiff_capture,
-        ("*",),
-        (
-            "infer . --method ls -o out --overwrite",
-            "evaluate . --method ls --draws draws.txt -o out --overwrite",
-        ),
+        "*",
+        f"""
+infer . {LS}
+evaluate . --method ls --draws draws.txt -o out --overwrite
+""",
     ),
     Target(
         "pgm and stack",
         pgm_and_stack_captures,
-        ("*/*.pgm", "*/*.tif"),
-        (*each("infer {} --method ls -o out --overwrite", "pgm stack"), "info stack"),
+        "*/*.pgm */*.tif",
+        f"""
+infer pgm {LS}
+infer stack {LS}
+info stack
+""",
     ),
     Target(
         "mat",
         mat_captures,
-        ("*/*.mat",),
-        (
-            *each("infer {} --method ls -o out --overwrite", "array numbered"),
-            "infer lamps --pixel-size 1 --method ls -o out --overwrite",
-            "info array",
-        ),
+        "*/*.mat",
+        f"""
+infer array {LS}
+infer numbered {LS}
+infer lamps --pixel-size 1 {LS}
+info array
+""",
     ),
     Target(
         "lights",
         light_files,
-        ("*.txt", "*.npy", "*.csv", "*.json", "*.dome"),
-        (
-            *each(
-                "infer . --method ls --lights {} -o out --overwrite",
-                "vectors.npy utf16.txt commas.txt named.csv list.json objects.json rig.dome",
-            ),
-            "infer . --method ls --lights azel.txt --light-format azel -o out --overwrite",
-            "infer . --method ls --light-positions positions.txt --pixel-size 1 --camera-matrix"
-            " camera.txt -o out --overwrite",
-        ),
+        "*.txt *.npy *.csv *.json *.dome",
+        f"""
+infer . {LS} --lights vectors.npy
+infer . {LS} --lights utf16.txt
+infer . {LS} --lights commas.txt
+infer . {LS} --lights named.csv
+infer . {LS} --lights list.json
+infer . {LS} --lights objects.json
+infer . {LS} --lights rig.dome
+infer . {LS} --lights azel.txt --light-format azel
+infer . {LS} --light-positions positions.txt --pixel-size 1 --camera-matrix camera.txt
+""",
     ),
     Target(
         "normals",
         normal_maps,
-        ("*",),
-        each(
-            "integrate {} --mask mask.png --colours colours.jpg --camera-matrix camera.txt -o out"
-            " --overwrite",
-            "n.png n.tif n.npy n.mat packed.mat",
-        ),
+        "*",
+        f"""
+integrate n.png {ON_IMAGES}
+integrate n.tif {ON_IMAGES}
+integrate n.npy {ON_IMAGES}
+integrate n.mat {ON_IMAGES}
+integrate packed.mat {ON_IMAGES}
+""",
     ),
-    Target("thin", thin, ("*/*",), each("infer {} --method ls -o out --overwrite", "column row")),
+    Target(
+        "thin",
+        thin,
+        "*/*",
+        f"""
+infer column {LS}
+infer row {LS}
+""",
+    ),
     Target(
         "meshes",
         meshes,
-        ("m.*",),
-        each("prepare --mesh m.{0} --size 8 --n-lights 16 -o out/{0}", "ply obj stl stl_ascii off"),
+        "m.*",
+        """
+prepare --mesh m.ply --size 8 --n-lights 16 -o out/ply
+prepare --mesh m.obj --size 8 --n-lights 16 -o out/obj
+prepare --mesh m.stl --size 8 --n-lights 16 -o out/stl
+prepare --mesh m.stl_ascii --size 8 --n-lights 16 -o out/stl_ascii
+prepare --mesh m.off --size 8 --n-lights 16 -o out/off
+""",
     ),
     Target(
         "ball",
         mirror_ball,
-        ("*/*", "known.txt"),
-        (
-            "calibrate ball --gray-ball gray --compare known.txt -o out --overwrite",
-            "calibrate ball --camera-matrix camera.txt --gray-card gray -o out --overwrite",
-        ),
+        "*/* known.txt",
+        """
+calibrate ball --gray-ball gray --compare known.txt -o out --overwrite
+calibrate ball --camera-matrix camera.txt --gray-card gray -o out --overwrite
+""",
     ),
     Target(
         "profiles",
         profiles,
-        ("*/*.*",),
-        tuple(
-            f"{command} {ending}{options}"
-            for ending in ("png", "tif", "jpg")
-            for command, options in (("infer", " --method ls -o out --overwrite"), ("info", ""))
-        ),
+        "*/*.*",
+        f"""
+infer png {LS}
+info png
+infer tif {LS}
+info tif
+infer jpg {LS}
+info jpg
+""",
     ),
     Target(
         "set",
         two_captures,
-        ("out/set/*", "out/set/*/*"),
-        (
-            "prepare capture second -o out/set",
-            "prepare capture -o out/set --update",
-            "train out/set -o out/run -q --config a.toml",
-        ),
-        earlier=("prepare capture -o out/set",),
+        "out/set/* out/set/*/*",
+        """
+prepare capture second -o out/set
+prepare capture -o out/set --update
+train out/set -o out/run -q --config a.toml
+""",
+        "prepare capture -o out/set",
         grows=True,
     ),
     Target(
         "earlier",
         two_captures,
-        (
-            "out/*/*.json",
-            "out/*.json",
-            "out/*.jsonl",
-            "out/*/*.npy",
-            "out/*/*.png",
-            "out/index.html",
-        ),
-        (
-            "infer capture --method ls -o out",
-            "infer second --method ls -o out --html --surface",
-            "infer capture --method ls -o out --update",
-            "integrate out/capture -o out/capture --overwrite",
-            "evaluate capture --method ls --n-lights 4 --n-lights 5 --trials 1 -o out/new"
-            " --figures --overwrite",
-            "prepare capture -o out/set",
-        ),
-        earlier=(
-            "evaluate capture --method ls --n-lights 4 --trials 1 -o out",
-            "infer capture --method ls -o out",
-        ),
+        "out/*/*.json out/*.json out/*.jsonl out/*/*.npy out/*/*.png out/index.html",
+        """
+infer capture --method ls -o out
+infer second --method ls -o out --html --surface
+infer capture --method ls -o out --update
+integrate out/capture -o out/capture --overwrite
+evaluate capture --method ls --n-lights 4 --n-lights 5 --trials 1 -o out/new --figures --overwrite
+prepare capture -o out/set
+""",
+        """
+evaluate capture --method ls --n-lights 4 --trials 1 -o out
+infer capture --method ls -o out
+""",
     ),
     Target(
         "weights",
         weights,
-        ("w.safetensors", "*.ckpt"),
-        (
-            "infer capture --weights w.safetensors -o out --overwrite",
-            *each("import-weights {} g.ckpt -o out/w.safetensors --overwrite", "g.ckpt old.ckpt"),
-        ),
+        "w.safetensors *.ckpt",
+        """
+infer capture --weights w.safetensors -o out --overwrite
+import-weights g.ckpt g.ckpt -o out/w.safetensors --overwrite
+import-weights old.ckpt g.ckpt -o out/w.safetensors --overwrite
+""",
     ),
     Target(
         "training",
         training,
-        ("set/*", "set/*/*", "a.toml", "out/run/*.safetensors", "out/run/metrics.csv"),
-        (f"{TRAIN} --resume --config a.toml", "train set -o out/new -q --config a.toml --steps 1"),
-        earlier=(f"{TRAIN} --config a.toml",),
+        "set/* set/*/* a.toml out/run/*.safetensors out/run/metrics.csv",
+        """
+train set -o out/run -q --resume --config a.toml
+train set -o out/new -q --config a.toml --steps 1
+""",
+        "train set -o out/run -q --config a.toml",
     ),
 )
 
 
-def write_corpus(
-    folder: Path, case: Path, run: Callable[[Path, str], int], names: tuple[str, ...] = ()
-) -> list[Target]:
+def write_corpus(folder, case, run, names=()):
     """Write the files of the targets into folders of their names, each with the output of an
     earlier run.
 
@@ -443,12 +422,11 @@ def write_corpus(
     for target in targets:
         case.mkdir(parents=True)
         target.write(case)
-        earlier = target.earlier or target.commands[:1]
-        for command in earlier:
+        for command in target.earlier:
             assert run(case, command) == 0, command
         shutil.copytree(case, folder / target.name)
         for command in target.commands:
-            if command not in earlier:
+            if command not in target.earlier:
                 assert run(case, command) == 0 or ".ckpt" in command, command
         shutil.rmtree(case)
     return targets

@@ -12,8 +12,6 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tifffile
@@ -52,7 +50,7 @@ ODD_TEXTS = (
     "%s",
     "a" * 5000,
 )
-ODD_VALUES: tuple[Any, ...] = (
+ODD_VALUES = (
     None,
     True,
     False,
@@ -110,7 +108,7 @@ _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _TEXTS = (".txt", ".lp", ".json", ".toml", ".csv", ".jsonl", ".html")
 
 
-def flip(data: bytes, rng: random.Random) -> bytes:
+def flip(data, rng):
     content = bytearray(data)
     for _ in range(rng.choice((1, 1, 2, 8, 64))):
         if content:
@@ -118,22 +116,22 @@ def flip(data: bytes, rng: random.Random) -> bytes:
     return bytes(content)
 
 
-def flip_header(data: bytes, rng: random.Random) -> bytes:
+def flip_header(data, rng):
     return flip(data[:128], rng) + data[128:]
 
 
-def cut(data: bytes, rng: random.Random) -> bytes:
+def cut(data, rng):
     return data[: rng.randrange(len(data) + 1)]
 
 
-def splice(data: bytes, rng: random.Random) -> bytes:
+def splice(data, rng):
     start, end = sorted(rng.randrange(len(data) + 1) for _ in range(2))
     if rng.random() < 0.5:
         return data[:start] + data[end:]
     return data[:end] + data[start:end] * rng.choice((1, 3, 50)) + data[end:]
 
 
-def odd_word(data: bytes, rng: random.Random) -> bytes:
+def odd_word(data, rng):
     """Write an odd binary number somewhere."""
     form = rng.choice(("<I", ">I", "<H", ">H", "<Q"))
     word = struct.pack(
@@ -143,12 +141,12 @@ def odd_word(data: bytes, rng: random.Random) -> bytes:
     return data[:place] + word + data[place + len(word) :]
 
 
-def fill(data: bytes, rng: random.Random) -> bytes:
+def fill(data, rng):
     start, end = sorted(rng.randrange(len(data) + 1) for _ in range(2))
     return data[:start] + bytes([rng.choice((0, 255, 32))]) * (end - start) + data[end:]
 
 
-def long(data: bytes, rng: random.Random) -> bytes:
+def long(data, rng):
     """Repeat the file, or one of its lines, up to a length of megabytes."""
     rows = data.split(b"\n")
     part = rng.choice((data, rng.choice(rows) + b"\n", b"\n", b" ", b"1 ")) or b"\n"
@@ -156,7 +154,7 @@ def long(data: bytes, rng: random.Random) -> bytes:
     return data[: rng.randrange(len(data) + 1)] + part * (length // len(part))
 
 
-def garbage(data: bytes, rng: random.Random) -> bytes:
+def garbage(data, rng):
     return rng.choice(
         (
             b"",
@@ -169,7 +167,7 @@ def garbage(data: bytes, rng: random.Random) -> bytes:
     )
 
 
-def number(data: bytes, rng: random.Random) -> bytes:
+def number(data, rng):
     found = list(_NUMBER.finditer(data))
     if not found:
         return flip(data, rng)
@@ -177,7 +175,7 @@ def number(data: bytes, rng: random.Random) -> bytes:
     return data[: match.start()] + rng.choice(ODD_NUMBERS).encode() + data[match.end() :]
 
 
-def lines(data: bytes, rng: random.Random) -> bytes:
+def lines(data, rng):
     rows = data.split(b"\n")
     place = rng.randrange(len(rows))
     changed = (
@@ -191,15 +189,15 @@ def lines(data: bytes, rng: random.Random) -> bytes:
     return b"\n".join(rows)
 
 
-def json_value(data: bytes, rng: random.Random) -> bytes:
+def json_value(data, rng):
     """Replace, remove or repeat one value of a JSON document."""
     try:
         document = json.loads(data)
     except ValueError:
         return flip(data, rng)
-    places: list[tuple[Any, Any]] = []
+    places = []
 
-    def collect(value: Any) -> None:
+    def collect(value):
         for key in (
             value
             if isinstance(value, dict)
@@ -222,7 +220,7 @@ def json_value(data: bytes, rng: random.Random) -> bytes:
     return json.dumps(document).encode("utf-8", "surrogatepass")
 
 
-def png_header(data: bytes, rng: random.Random) -> bytes:
+def png_header(data, rng):
     """Change the size or the kind of a PNG, with the right checksum."""
     if not data.startswith(b"\x89PNG") or len(data) < 33:
         return flip_header(data, rng)
@@ -237,7 +235,7 @@ def png_header(data: bytes, rng: random.Random) -> bytes:
 
 
 @cache
-def _bomb(suffix: str) -> bytes:
+def _bomb(suffix):
     """Return a whole file of many zeros: a picture of 8000 x 8000 pixels, normals of 4000 x 4000,
     or weights.
     """
@@ -271,7 +269,7 @@ def _bomb(suffix: str) -> bytes:
     return buffer.getvalue()
 
 
-def safetensors_header(data: bytes, rng: random.Random) -> bytes:
+def safetensors_header(data, rng):
     """Change a value in the header of a safetensors file, or in the JSON texts of its metadata."""
     length = int.from_bytes(data[:8], "little")
     try:
@@ -302,7 +300,7 @@ OF_BYTES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
 )
 
 
-def mat_type(data: bytes, rng: random.Random) -> bytes:
+def mat_type(data, rng):
     """Change the type of an element of a .mat file, in its compressed content if there is one."""
     if data[128:132] == struct.pack("<I", 15):
         length = struct.unpack("<I", data[132:136])[0]
@@ -315,13 +313,13 @@ def mat_type(data: bytes, rng: random.Random) -> bytes:
     return data[:128] + _another_type(data[128:], rng)
 
 
-def _another_type(content: bytes, rng: random.Random) -> bytes:
+def _another_type(content, rng):
     place = 8 * rng.randrange(min(10, len(content) // 8) or 1)
     kind = rng.choice((0, 8, 10, 11, 14, 15, 16, 17, 18, 20, 200, 65_535, 0x40001, 0x8000FFFF))
     return content[:place] + struct.pack("<I", kind) + content[place + 4 :]
 
 
-def npy_header(data: bytes, rng: random.Random) -> bytes:
+def npy_header(data, rng):
     """Change the shape or the type in the header of a .npy file."""
     end = 10 + int.from_bytes(data[8:10], "little")
     header = data[10:end].decode("latin-1")
@@ -360,7 +358,7 @@ def npy_header(data: bytes, rng: random.Random) -> bytes:
     return data[:8] + struct.pack("<H", len(text)) + text + data[end:]
 
 
-def profile(data: bytes, rng: random.Random) -> bytes:
+def profile(data, rng):
     """Write an image anew with a damaged colour profile."""
     try:
         with Image.open(io.BytesIO(data)) as image:
@@ -374,14 +372,12 @@ def profile(data: bytes, rng: random.Random) -> bytes:
         return flip_header(data, rng)
 
 
-def _tag(data: bytes, rng: random.Random) -> bytes:
+def _tag(data, rng):
     """Change a word in the table of a profile, or in one of its curves."""
-    count = int.from_bytes(data[128:132], "big")
-    entry = 132 + 12 * rng.randrange(count)
+    entry = 132 + 12 * rng.randrange(int.from_bytes(data[128:132], "big"))
     place = entry + 4 * rng.randrange(3)
     if rng.random() < 0.7:
-        curve = data.find(rng.choice((b"para", b"curv")))
-        place = max(curve, 0) + 4 * rng.randrange(9)
+        place = max(data.find(rng.choice((b"para", b"curv"))), 0) + 4 * rng.randrange(9)
     word = rng.choice(
         (
             b"para",
@@ -402,7 +398,7 @@ OF_FORMATS = {
 }
 
 
-def mutate(path: Path, others: list[Path], rng: random.Random) -> str:
+def mutate(path, others, rng):
     """Change a file in one way and return a description."""
     if rng.random() < 0.06:
         return _another_kind(path, others, rng)
@@ -421,7 +417,7 @@ def mutate(path: Path, others: list[Path], rng: random.Random) -> str:
     return f"{change.__name__.strip('<>')} {path.name}"
 
 
-def rename(path: Path, rng: random.Random) -> Path:
+def rename(path, rng):
     """Give a file or a folder an odd name, most often with its own suffix, and return it."""
     suffix = path.suffix if rng.random() < 0.8 else ""
     new = path.with_name(os.fsdecode(rng.choice(ODD_NAMES)) + suffix)
@@ -431,7 +427,7 @@ def rename(path: Path, rng: random.Random) -> Path:
     return new
 
 
-def odd_path(name: str, rng: random.Random) -> str:
+def odd_path(name, rng):
     """Return another way to write the path of a file or folder in the present folder."""
     forms = (
         "{}",
@@ -449,7 +445,7 @@ def odd_path(name: str, rng: random.Random) -> str:
     return rng.choice(forms).format(name, name)
 
 
-def _another_kind(path: Path, others: list[Path], rng: random.Random) -> str:
+def _another_kind(path, others, rng):
     """Put something else in the place of a file: a folder, a pipe, a device, another file, or
     nothing.
     """

@@ -28,7 +28,6 @@ import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from functools import cache, partial
@@ -37,7 +36,7 @@ from pathlib import Path
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
-from corpus import OUT, Target, write_corpus  # noqa: E402
+from corpus import OUT, write_corpus  # noqa: E402
 from mutations import mutate, odd_path, rename  # noqa: E402
 
 from kills import content  # noqa: E402
@@ -66,10 +65,10 @@ class Ended:
 class Worker:
     """A forked process that runs commands, with stdout and stderr in files of a folder."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self._folder, self._left = folder, 0
 
-    def run(self, folder: Path, command: str) -> Ended:
+    def run(self, folder, command):
         """Run a command in a folder."""
         if self._left == 0:
             self._start()
@@ -86,14 +85,14 @@ class Worker:
         ]
         return Ended(code, *texts, seconds, memory)  # type: ignore[call-arg]
 
-    def end(self) -> None:
+    def end(self):
         """End the process."""
         self._left = 0
         os.close(self._requests)
         os.close(self._replies)
         os.waitpid(self._child, 0)
 
-    def _start(self) -> None:
+    def _start(self):
         self._left = CASES_OF_A_PROCESS
         (requests, self._requests), (self._replies, replies) = os.pipe(), os.pipe()
         self._child = os.fork()
@@ -106,7 +105,7 @@ class Worker:
         os.close(requests)
         os.close(replies)
 
-    def _serve(self, requests: int, replies: int) -> None:
+    def _serve(self, requests, replies):
         """Run the commands of the requests in this process."""
         warnings.simplefilter("always", RuntimeWarning)
         resource.setrlimit(
@@ -130,13 +129,13 @@ class Worker:
             os.write(replies, reply.encode())
 
 
-def _memory(name: str) -> int:
+def _memory(name):
     """Return a figure of this process in bytes: VmRSS, VmHWM, its peak, or VmSize."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:")) * 1024
 
 
-def _run_here(command: str) -> int:
+def _run_here(command):
     from splinecli.cli.main import main
 
     sys.stdout, sys.stderr = (open(n, "w", encoding="utf-8", closefd=False) for n in (1, 2))  # noqa: SIM115
@@ -150,7 +149,7 @@ def _run_here(command: str) -> int:
         sys.stderr.flush()
 
 
-def run_warm(folder: Path, command: str) -> int:
+def run_warm(folder, command):
     """Run a command in this process, so that what it imports is there for all forked processes."""
     from splinecli.cli.main import main
 
@@ -163,7 +162,7 @@ def run_warm(folder: Path, command: str) -> int:
         os.chdir(here)
 
 
-def prepare_process() -> None:
+def prepare_process():
     """Keep libraries from starting threads, which a forked process would lack, and leave out long
     work.
     """
@@ -183,7 +182,7 @@ def prepare_process() -> None:
     meshes.split_long_edges = partial(meshes.split_long_edges, most_faces=10)
 
 
-def faults(ended: Ended, before: dict[str, bytes], after: dict[str, bytes]) -> Iterator[str]:
+def faults(ended, before, after):
     """Yield what is wrong with a case."""
     if ended.code not in DOCUMENTED:
         yield f"exit code {ended.code}"
@@ -212,9 +211,7 @@ def faults(ended: Ended, before: dict[str, bytes], after: dict[str, bytes]) -> I
         yield f"files are left: {left}"
 
 
-def run_case(
-    number: int, corpus: Path, targets: list[Target], work: Path, worker: Worker
-) -> tuple[str, Ended, list[str]]:
+def run_case(number, corpus, targets, work, worker):
     """Run case `number` and return what it was, how it ended and what is wrong with it."""
     rng = random.Random(number)
     target = rng.choice(targets)
@@ -243,7 +240,7 @@ def run_case(
     return f"{target.name}: {did}; {printable(command)}", ended, found
 
 
-def main() -> int:
+def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

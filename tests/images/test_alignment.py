@@ -4,16 +4,13 @@ exact.
 
 import json
 import tracemalloc
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.random import default_rng
 
-from scenes import ring_lights, shade, write_capture
-from splinecli.errors import InputError, UsageError
+from scenes import parametrize, refuses, ring_lights, shade, tilted, vectors, write_capture
+from splinecli.errors import UsageError
 from splinecli.images import alignment
 from splinecli.images.alignment import (
     align_images,
@@ -27,16 +24,15 @@ from splinecli.maths.robust import fit_scaled_normals
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 
-Floats = NDArray[np.float64]
 SIDE = 120
 LIGHTS = np.concatenate((ring_lights(5, 40), ring_lights(3, 20, 0.4)))
 
 
-def scene(x: Floats, y: Floats, textured: bool) -> tuple[Floats, Floats]:
+def scene(x, y, textured):
     """Return normals (..., 3) and albedo at places in pixels: a relief of bumps, on a dome that
     ends in the dark.
     """
-    waves = np.random.default_rng(3)
+    waves = default_rng(3)
     right, up = np.zeros_like(x), np.zeros_like(x)
     for _ in range(12):
         angle, length, phase = (
@@ -60,10 +56,10 @@ def scene(x: Floats, y: Floats, textured: bool) -> tuple[Floats, Floats]:
             2 * np.pi / length * (np.cos(angle) * x + np.sin(angle) * y) + phase
         )
     rim = 1 / (1 + np.exp((np.hypot(x - middle, y - middle) - 0.42 * SIDE) / 0.7))
-    return unit(np.stack((right, up, np.ones_like(x)), axis=-1)), albedo * rim
+    return tilted(right, up), albedo * rim
 
 
-def photographs(transforms: Floats, *, textured: bool, gloss: float = 0.0) -> NDArray[np.float32]:
+def photographs(transforms, *, textured, gloss=0.0):
     """Return the images (F, SIDE, SIDE) of a camera that moved: the reference's pixel p is at
     transform @ p.
     """
@@ -77,20 +73,18 @@ def photographs(transforms: Floats, *, textured: bool, gloss: float = 0.0) -> ND
     return np.array(images, np.float32)
 
 
-def motions(pixels: float, kind: str) -> Floats:
+def motions(pixels, kind):
     """Return transforms of which the first is none, and the others move points by about so many
     pixels.
     """
     rng, middle = (
-        np.random.default_rng(int(10 * pixels)),
+        default_rng(int(10 * pixels)),
         np.array([[1, 0, SIDE / 2], [0, 1, SIDE / 2], [0, 0, 1]]),
     )
     found = [np.eye(3)]
     for _ in LIGHTS[1:]:
-        angle, turn, zoom = (
-            rng.uniform(0, 2 * np.pi),
-            *rng.uniform(-0.5, 0.5, 2) * 2 * pixels / SIDE,
-        )
+        angle = rng.uniform(0, 2 * np.pi)
+        turn, zoom = rng.uniform(-0.5, 0.5, 2) * 2 * pixels / SIDE
         move = np.eye(3)
         move[:2, 2] = pixels * np.array((np.cos(angle), np.sin(angle)))
         if kind != "translation":
@@ -107,45 +101,43 @@ MASK = np.hypot(*(np.indices((SIDE, SIDE)) - (SIDE - 1) / 2)) < 0.42 * SIDE
 PLACES = np.stack((*np.nonzero(MASK)[::-1], np.ones(MASK.sum())))
 
 
-def residuals(found: Floats, true: Floats) -> Floats:
+def residuals(found, true):
     """Return the root mean square distances (F - 1,) in pixels over the object."""
     points = [each @ PLACES for each in (found[1:], true[1:])]
     one, other = (each[:, :2] / each[:, 2:] for each in points)
     return np.asarray(np.sqrt(((one - other) ** 2).sum(axis=1).mean(axis=1)))
 
 
-@pytest.mark.parametrize("lights", [LIGHTS, None], ids=["lights", "unknown-lights"])
-@pytest.mark.parametrize("pixels", [0.3, 2.0, 20.0])
-def test_the_motion_of_a_textured_object_is_found_to_a_tenth_of_a_pixel(
-    pixels: float, lights: Floats | None
-) -> None:
+@parametrize("lights", [LIGHTS, None], ids=["lights", "unknown-lights"])
+@parametrize("pixels", [0.3, 2.0, 20.0])
+def test_the_motion_of_a_textured_object_is_found_to_a_tenth_of_a_pixel(pixels, lights):
     true = motions(pixels, "translation")
     found = align_images(photographs(true, textured=True), MASK, lights)
     assert residuals(found.transforms, true).max() < 0.1
     assert found.unexplained is None
 
 
-@pytest.mark.parametrize("pixels", [1.0, 10.0])
-def test_the_motion_of_a_plain_object_is_found_to_a_third_of_a_pixel(pixels: float) -> None:
+@parametrize("pixels", [1.0, 10.0])
+def test_the_motion_of_a_plain_object_is_found_to_a_third_of_a_pixel(pixels):
     true = motions(pixels, "translation")
     found = align_images(photographs(true, textured=False, gloss=0.3), MASK, LIGHTS)
     assert residuals(found.transforms, true).max() < 0.3
 
 
-@pytest.mark.parametrize("kind", ["similarity", "homography"])
-def test_rotation_zoom_and_perspective_are_found(kind: str) -> None:
+@parametrize("kind", "similarity homography")
+def test_rotation_zoom_and_perspective_are_found(kind):
     true = motions(4.0, kind)
     found = align_images(photographs(true, textured=True), MASK, LIGHTS)
     assert found.model == kind
     assert residuals(found.transforms, true).max() < 0.15
 
 
-def test_images_that_did_not_move_are_left_as_they_are() -> None:
+def test_images_that_did_not_move_are_left_as_they_are():
     found = align_images(photographs(motions(0, "translation"), textured=True), MASK, LIGHTS)
     assert (found.transforms == np.eye(3)).all()
 
 
-def test_aligned_images_give_the_normals_of_unmoved_ones() -> None:
+def test_aligned_images_give_the_normals_of_unmoved_ones():
     true = motions(5.0, "similarity")
     still, moved = (photographs(each, textured=True) for each in (motions(0, "translation"), true))
     found = align_images(moved, MASK, LIGHTS).transforms
@@ -163,50 +155,46 @@ def test_aligned_images_give_the_normals_of_unmoved_ones() -> None:
     assert angle_between_deg(unit(one), unit(other)).mean() < 0.3
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "spoil",
     [
         lambda image: image[::-1, ::-1],
-        lambda image: np.random.default_rng(0).uniform(0, 1, image.shape),
-        lambda image: np.random.default_rng(0).uniform(0, 1, image.shape) * MASK,
+        lambda image: default_rng(0).uniform(0, 1, image.shape),
+        lambda image: default_rng(0).uniform(0, 1, image.shape) * MASK,
     ],
     ids=["upside-down", "another-object", "another-object-of-its-shape"],
 )
-@pytest.mark.parametrize("textured", [True, False])
-def test_an_image_that_fits_nowhere_is_named(
-    spoil: Callable[[Floats], Floats], textured: bool
-) -> None:
+@parametrize("textured", [True, False])
+def test_an_image_that_fits_nowhere_is_named(spoil, textured):
     images = photographs(motions(2.0, "translation"), textured=textured, gloss=0.3)
     images[3] = spoil(images[3])
     assert align_images(images, MASK, LIGHTS).unexplained == 3
 
 
-def test_transforms_of_reduced_windows_hold_in_whole_images() -> None:
+def test_transforms_of_reduced_windows_hold_in_whole_images():
     shift = np.eye(3)[None].repeat(2, 0)
     shift[1, :2, 2] = 1.5, -0.5
     whole = place_in_whole(shift, left=10, top=20, stride=3)
-    assert whole[1] == pytest.approx(np.array([[1, 0, 4.5], [0, 1, -1.5], [0, 0, 1]]))
+    assert whole[1] == pytest.approx(vectors("1 0 4.5; 0 1 -1.5; 0 0 1"))
     assert reduced(np.arange(35, dtype=np.float32).reshape(5, 7), 3).tolist() == [[8.0, 11.0]]
 
 
-def test_pixels_that_an_image_lacks_are_not_common() -> None:
+def test_pixels_that_an_image_lacks_are_not_common():
     transforms = np.eye(3)[None].repeat(2, 0)
     transforms[1, :2, 2] = 2.0, -1.0
     common = common_pixels(transforms, (4, 6))
     assert common.tolist() == [[False] * 6, *[[True] * 4 + [False] * 2] * 3]
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("work", "most"),
     [
         # the nearest pixels in two bytes, and the interpolated ones in four
-        (lambda image, motion: resample(image, image.astype(np.float32), motion), 6 + 4),
+        (lambda image, motion: resample(image, np.float32(image), motion), 6 + 4),
         (lambda image, motion: common_pixels(motion[None], image.shape[:2]), 1),
     ],
 )
-def test_whole_images_take_no_memory_but_for_their_values(
-    work: Callable[[Any, Floats], object], most: int
-) -> None:
+def test_whole_images_take_no_memory_but_for_their_values(work, most):
     """The memory of a capture is checked before it is read, without the places of its pixels."""
     image, motion = np.ones((1000, 1000, 1), np.uint16), np.eye(3)
     motion[:2, 2] = 1.5, -0.5
@@ -218,24 +206,24 @@ def test_whole_images_take_no_memory_but_for_their_values(
 
 
 @pytest.fixture
-def write_moved(tmp_path: Path) -> Iterator[Callable[..., Path]]:
-    def write(spoilt: bool = False, pixels: float = 3.0) -> Path:
+def write_moved(tmp_path):
+    def write(spoilt=False, pixels=3.0):
         images = photographs(motions(pixels, "translation"), textured=True)
         if spoilt:
-            images[2] = np.random.default_rng(0).uniform(0, 1, (SIDE, SIDE))
-        stored = np.rint(images / images.max() * 60_000).astype(np.uint16)
+            images[2] = default_rng(0).uniform(0, 1, (SIDE, SIDE))
+        stored = np.uint16(np.rint(images / images.max() * 60_000))
         return write_capture(tmp_path / "moved", stored, LIGHTS, mask=MASK)
 
     yield write
 
 
-def infer(folder: Path, tmp_path: Path, **options: Any) -> dict[str, Any]:
+def infer(folder, tmp_path, **options):
     return infer_capture(
         folder, InferOptions(align=True, method="ls", output=str(tmp_path / "out"), **options)
     )
 
 
-def test_infer_aligns_and_reports(write_moved: Callable[..., Path], tmp_path: Path) -> None:
+def test_infer_aligns_and_reports(write_moved, tmp_path):
     report = infer(write_moved(), tmp_path)
     written = json.loads((tmp_path / "out/moved/report.json").read_text())
     assert written["alignment"]["reference"] == "000.png"
@@ -251,29 +239,23 @@ def test_infer_aligns_and_reports(write_moved: Callable[..., Path], tmp_path: Pa
     assert part["alignment"]["reference"] == "001.png" and len(part["alignment"]["transforms"]) == 5
 
 
-def test_unmoved_images_are_no_reason_to_warn(
-    write_moved: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_unmoved_images_are_no_reason_to_warn(write_moved, tmp_path):
     report = infer(write_moved(pixels=0.0), tmp_path)
     assert "images_aligned" not in [warning["code"] for warning in report["warnings"]]
     assert max(report["alignment"]["moved_pixels"]) < 0.1
 
 
-def test_captures_that_cannot_be_aligned_are_refused(
-    write_moved: Callable[..., Path], tmp_path: Path
-) -> None:
-    with pytest.raises(InputError, match=r"cannot match 002\.png"):
+def test_captures_that_cannot_be_aligned_are_refused(write_moved, tmp_path):
+    with refuses(r"cannot match 002\.png"):
         infer(write_moved(spoilt=True), tmp_path)
     for options in ({"light_indices": (0, 1, 2, 3)}, {"n_lights": 4}):
-        with pytest.raises(UsageError, match="leaves 4 images, but --align needs at least 5"):
+        with refuses("leaves 4 images, but --align needs at least 5", UsageError):
             infer(write_moved(), tmp_path, **options)
     for crop, size in (("60,60,30,1", "30 x 1"), ("60,60,1,30", "1 x 30"), ("60,60,1,1", "1 x 1")):
-        with pytest.raises(
-            InputError, match=f"found an object of {size} pixels, expected .* 8 x 8"
-        ):
+        with refuses(f"found an object of {size} pixels, expected .* 8 x 8"):
             infer(write_moved(), tmp_path, crop=crop)
 
 
-def test_large_captures_are_reduced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_captures_are_reduced(monkeypatch):
     monkeypatch.setattr(alignment, "MOST_VALUES", 100_000)
     assert alignment.stride_for(1_000_000) == 4

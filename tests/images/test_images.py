@@ -9,10 +9,21 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
-from numpy.testing import assert_array_equal
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
-from scenes import codes, shade, sphere_cap, spiral_lights, to_uint16, with_chunk, write_capture
+from scenes import (
+    codes,
+    parametrize,
+    refuses,
+    shade,
+    sphere_cap,
+    spiral_lights,
+    to_uint16,
+    with_chunk,
+    write_capture,
+)
 from splinecli.capture.formats.images import decode_image, to_linear
 from splinecli.capture.reader import CaptureOptions, open_capture
 from splinecli.errors import InputError
@@ -32,14 +43,14 @@ def sphere(*, noise=0.01):
     """Images (F, H, W) of a matte sphere, which fills the picture, with a largest value of about 1;
     its normals.
     """
-    normals, rng = sphere_cap(SIDE), np.random.default_rng(3)
+    normals, rng = sphere_cap(SIDE), default_rng(3)
     albedo = rng.uniform(0.6, 1, (SIDE, SIDE)) if noise else 1.0
     images = albedo * np.moveaxis(shade(normals, LIGHTS), 2, 0)
     return images * rng.normal(1, noise, images.shape), normals
 
 
 def clip(images, level, exposure=2.0):
-    return np.minimum(np.rint(images * exposure * level), level).astype(np.uint16)
+    return np.uint16(np.minimum(np.rint(images * exposure * level), level))
 
 
 def find(images, *, given=None, stated=None):
@@ -53,8 +64,8 @@ def find(images, *, given=None, stated=None):
     return saturation.white_level, number
 
 
-@pytest.mark.parametrize("level", [4095, 1023, 16_383, 4095 << 4, 15_600, 3839])
-@pytest.mark.parametrize("exposure", [1.1, 2.0, 4.0])
+@parametrize("level", [4095, 1023, 16_383, 4095 << 4, 15_600, 3839])
+@parametrize("exposure", [1.1, 2.0, 4.0])
 def test_levels_below_full_scale_are_found(level, exposure):
     images = clip(sphere()[0], level, exposure)
     assert find(images) == (WhiteLevel(level, "images"), np.count_nonzero(images == level))
@@ -63,12 +74,12 @@ def test_levels_below_full_scale_are_found(level, exposure):
 def test_the_file_s_full_scale_is_the_level_where_it_is_reached():
     images = clip(sphere()[0], 65_535)
     assert find(images) == (FULL_SCALE, np.count_nonzero(images == 65_535))
-    eight_bit = clip(sphere()[0], 255).astype(np.uint8)
+    eight_bit = np.uint8(clip(sphere()[0], 255))
     assert find(eight_bit) == (WhiteLevel(255, "full scale"), np.count_nonzero(eight_bit == 255))
 
 
 def bright(scale):
-    return np.rint(sphere()[0] * scale).clip(0).astype(np.uint16)
+    return np.uint16(np.rint(sphere()[0] * scale).clip(0))
 
 
 def with_background(value, scale=20_000):
@@ -78,16 +89,16 @@ def with_background(value, scale=20_000):
 
 
 def posterised(levels, step):
-    return (np.rint(sphere()[0] / sphere()[0].max() * (levels - 1)) * step).astype(np.uint16)
+    return np.uint16(np.rint(sphere()[0] / sphere()[0].max() * (levels - 1)) * step)
 
 
 def ring_over_a_plane():
     """Without noise: a flat patch that is equally bright under all lights of a ring, on a darker
     textured plane.
     """
-    texture = np.random.default_rng(0).uniform(0.2, 0.99, (SIDE, SIDE))
+    texture = default_rng(0).uniform(0.2, 0.99, (SIDE, SIDE))
     texture[10:40, 10:40] = 1
-    return np.repeat(np.rint(texture * 30_000)[None], 12, axis=0).astype(np.uint16)
+    return np.uint16(np.repeat(np.rint(texture * 30_000)[None], 12, axis=0))
 
 
 def patches_of_a_cube():
@@ -106,7 +117,7 @@ def normalised_to_12_bits():
     return to_uint16(images / images.max(axis=(1, 2), keepdims=True) * 4095)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "images",
     [
         pytest.param(bright(4000), id="12 bits, not clipped"),
@@ -138,7 +149,7 @@ def test_one_clipped_image_is_not_enough():
     assert find(images)[0] == WhiteLevel(4095, "images")
 
 
-@pytest.mark.parametrize("stored", [4095, 4095 << 4, 65_535])
+@parametrize("stored", [4095, 4095 << 4, 65_535])
 def test_levels_that_the_files_state(stored):
     """A stated number of bits, whether or not the program shifted or scaled them to 16."""
     images = bright(100)
@@ -157,15 +168,13 @@ def test_a_given_level_is_used_as_it_is():
         np.count_nonzero(images == 4095),
     )
     assert find(images / 4095) == (None, 0)
-    with pytest.raises(
-        InputError, match=r"0\.png: the white level is 4095, but 8-bit pixels end at 255\. Lower"
-    ):
-        find(images.astype(np.uint8), given=4095)
+    with refuses(r"0\.png: the white level is 4095, but 8-bit pixels end at 255\. Lower"):
+        find(np.uint8(images), given=4095)
 
 
 def ls_error_deg(folder, normals, **settings):
     capture = prepare_capture(open_capture(folder, CaptureOptions(**settings)))
-    solution = np.linalg.lstsq(LIGHTS, capture.observations.T.astype(np.float64), rcond=None)[0]
+    solution = np.linalg.lstsq(LIGHTS, np.float64(capture.observations.T), rcond=None)[0]
     return float(angle_between_deg(unit(solution.T), normals.reshape(-1, 3)).mean())
 
 
@@ -188,9 +197,7 @@ def test_12_bit_images_are_restored_like_16_bit_ones(tmp_path):
     assert ls_error_deg(folder, normals, white_level=4095) == found
 
 
-@pytest.mark.parametrize(
-    "bits, level", [((12,), 4095), ((16,), None), ((12, 12, 12), 4095), ((5, 6, 5), None)]
-)
+@parametrize("bits, level", [((12,), 4095), ((16,), None), ((12, 12, 12), 4095), ((5, 6, 5), None)])
 def test_png_states_its_bits(tmp_path, bits, level):
     images = bright(100)
     images[0, 0, 0] = 4095  # one pixel alone would not tell
@@ -207,7 +214,7 @@ def test_png_states_its_bits(tmp_path, bits, level):
     assert prepare_capture(open_capture(folder)).white_level == FULL_SCALE
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "tag, value, level",
     [(281, 4095, 4095), (281, 4001, None), (50717, 3839, 3839), (50717, 65_535, None)],
 )
@@ -260,7 +267,7 @@ GRID_LIGHTS = unit(np.array([(x, y, 1.4) for x in (-1, 0, 1) for y in (-1, 0, 1)
 
 def matte(pixels):
     """Observations (pixels, 9) of matte surfaces that look to the camera, of every albedo."""
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     normals = rng.normal(size=(pixels, 3)) * (0.3, 0.3, 0.1) + (0, 0, 1)
     normals *= rng.uniform(0.3, 1, (pixels, 1)) / np.linalg.norm(normals, axis=1, keepdims=True)
     return np.maximum(normals @ GRID_LIGHTS.T, 0)
@@ -271,7 +278,7 @@ def clipped_at(level):
     restored.
     """
     truth = matte(500)
-    stored = np.minimum(truth, level).astype(np.float32)
+    stored = np.float32(np.minimum(truth, level))
     restored = stored.copy()
     restore_saturated(restored, truth >= level, GRID_LIGHTS)
     return truth, truth >= level, stored, restored
@@ -284,7 +291,7 @@ def test_matte_pixels_come_back():
     known = saturated.any(axis=1) & ((~saturated).sum(axis=1) >= 4)
     assert known.sum() > 50
     # Stored, they are off by up to 0.4; a pixel's four others tell three unknowns.
-    np.testing.assert_allclose(restored[known], truth[known], atol=0.015)
+    assert_allclose(restored[known], truth[known], atol=0.015)
     assert np.abs(stored - truth)[known].max() > 0.2
 
 
@@ -296,7 +303,7 @@ def test_fewer_than_three_others_still_bound_them():
     assert np.abs(restored - truth)[few].mean() < 0.9 * np.abs(stored - truth)[few].mean()
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "pixels, expected",
     [
         (np.array([[255, 3, 3], [254, 254, 254]], np.uint8), [True, False]),
@@ -316,14 +323,13 @@ def disc(x, y, radius):
     return (columns - x) ** 2 + (rows - y) ** 2 < radius**2
 
 
-def test_the_largest_part_with_its_holes_filled():
-    rng = np.random.default_rng(0)
+def test_the_largest_part_with_its_holes_filled(rng):
     thing, crumb, pupil = disc(50, 60, 30), disc(105, 15, 8), disc(45, 55, 6)
     brightness = np.where(thing, 0.4, 0.004) + np.where(crumb, 0.6, 0)
     brightness[pupil] = 0.003  # black paint
     brightness[10, 60] = 5.0  # a hot pixel
     brightness *= rng.uniform(0.8, 1.2, brightness.shape)
-    found = find_object(brightness.astype(np.float32))
+    found = find_object(np.float32(brightness))
     assert (found != thing).mean() < 0.005
     assert found[pupil].all()
     assert not found[crumb].any()
@@ -332,24 +338,18 @@ def test_the_largest_part_with_its_holes_filled():
         find_object(wide.astype(np.float32), is_requested=False)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "brightness, said",
     [(np.zeros((WIDTH, WIDTH)), "are black"), (np.full((WIDTH, WIDTH), 0.5), "covers 100.0 %")],
 )
 def test_nothing_stands_out(brightness, said):
-    with pytest.raises(InputError, match=said):
-        find_object(brightness.astype(np.float32))
+    with refuses(said):
+        find_object(np.float32(brightness))
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "place",
-    [
-        "DiLiGenT/pmsData/ballPNG",
-        "DiLiGenT/pmsData/catPNG",
-        "uw/gray",
-        "uw/horse",
-        "synth/L17/bowl_S",
-    ],
+    "DiLiGenT/pmsData/ballPNG DiLiGenT/pmsData/catPNG uw/gray uw/horse synth/L17/bowl_S",
 )
 def test_real_objects(shared_data, place):
     """Intersection over union with the masks that people drew."""

@@ -5,10 +5,22 @@ known.
 import re
 
 import numpy as np
-import pytest
-from numpy.testing import assert_allclose
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx
 
-from scenes import codes, shade, sphere, sphere_cap, spiral_lights, write_capture
+from scenes import (
+    codes,
+    on_sphere,
+    parametrize,
+    shade,
+    sphere,
+    sphere_cap,
+    spiral_lights,
+    tilted,
+    vectors,
+    write_capture,
+)
 from splinecli.capture.arrays import open_arrays
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.reader import CaptureOptions, open_capture
@@ -20,10 +32,8 @@ from splinecli.recipe import RecipeOptions, prepare_capture
 from splinecli.results.map_values import albedo_map
 
 LIGHTS = spiral_lights(10, 50, 15)
-SOFT = np.tile(
-    [(1.5, 0.8, 0.7), (0.7, 1.5, 0.8), (0.8, 0.7, 1.5), (1, 1, 1), (1.3, 1.3, 0.4)], (2, 1)
-)
-PURE = np.tile([(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1), (1, 1, 0)], (2, 1)).astype(float)
+SOFT = np.tile(vectors("1.5 0.8 0.7; 0.7 1.5 0.8; 0.8 0.7 1.5; 1 1 1; 1.3 1.3 0.4"), (2, 1))
+PURE = np.tile(vectors("1 0 0; 0 1 0; 0 0 1; 1 1 1; 1 1 0"), (2, 1))
 
 
 def striped(colours):
@@ -31,14 +41,12 @@ def striped(colours):
     3) and its mask.
     """
     normals, mask = sphere(48, 0.9)
-    stripes = np.array([(0.9, 0.2, 0.2), (0.2, 0.8, 0.3), (0.2, 0.3, 0.9), (0.7, 0.7, 0.7)])[
-        np.arange(48) // 4 % 4
-    ]
+    stripes = vectors("0.9 0.2 0.2; 0.2 0.8 0.3; 0.2 0.3 0.9; 0.7 0.7 0.7")[np.arange(48) // 4 % 4]
     shaded = np.where(mask[..., None], shade(normals, LIGHTS), 0)
     images = np.einsum("hwf,wc,fc->fhwc", shaded, stripes, colours)
-    noise = np.random.default_rng(0).normal(0, 0.002, images.shape)
+    noise = default_rng(0).normal(0, 0.002, images.shape)
     return (
-        np.rint((images / images.max() + noise).clip(0, 1) * 60_000).astype(np.uint16),
+        np.uint16(np.rint((images / images.max() + noise).clip(0, 1) * 60_000)),
         normals,
         mask,
     )
@@ -64,7 +72,7 @@ def test_colours_are_divided_out(tmp_path):
     assert "estimated_colours" in codes(capture)
     ratios = capture.estimated_colours / SOFT
     assert_allclose(ratios / ratios.mean(axis=0), np.ones((10, 3)), atol=0.1)
-    plain = images[:, mask].mean(axis=2).T.astype(np.float32)
+    plain = np.float32(images[:, mask].mean(axis=2).T)
     assert (
         error_deg(capture.observations, normals, mask)
         < 2
@@ -72,7 +80,7 @@ def test_colours_are_divided_out(tmp_path):
         < error_deg(plain / plain.max(), normals, mask)
     )
     # Lamps of any colour give the same object the same colours.
-    normal_map = np.where(mask[..., None], normals, 0).astype(np.float32)
+    normal_map = np.float32(np.where(mask[..., None], normals, 0))
     albedo = albedo_map(source, capture, normal_map)[mask]
     red = albedo / albedo.sum(axis=1, keepdims=True)
     stripe = np.nonzero(mask)[1] // 4 % 4 == 0
@@ -93,14 +101,14 @@ def test_pure_colours_are_named():
 def test_a_gray_object_needs_no_colours():
     normals, mask = sphere(48, 0.9)
     shaded = np.where(mask[..., None], shade(normals, LIGHTS), 0)
-    images = np.rint(np.einsum("hwf,fc->fhwc", shaded, PURE) * 40_000).astype(np.uint16)
+    images = np.uint16(np.rint(np.einsum("hwf,fc->fhwc", shaded, PURE) * 40_000))
     capture = prepare_capture(open_arrays(images, LIGHTS, mask, light_intensities=np.ones(10)))
     assert not {"light_colours", "estimated_colours"} & set(codes(capture))
 
 
-@pytest.mark.parametrize("change", [0.0, 0.03])
+@parametrize("change", [0.0, 0.03])
 def test_white_lamps_are_left_alone(change):
-    colours = 1 + change * np.random.default_rng(1).normal(size=(10, 3))
+    colours = 1 + change * default_rng(1).normal(size=(10, 3))
     images, _, mask = striped(colours)
     assert prepare_capture(open_arrays(images, LIGHTS, mask)).estimated_colours is None
 
@@ -120,33 +128,33 @@ def textured_sphere(directions, *, shine=0.0):
     """Observations (P, F) of a sphere with attached shadows, random albedo, noise, and highlights
     if any.
     """
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     axis = np.linspace(-0.95, 0.95, 50)
     x, y = (values.ravel() for values in np.meshgrid(axis, axis))
     inside = x**2 + y**2 < 0.9
     x, y = x[inside], y[inside]
-    normals = np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
+    normals = on_sphere(x, y)
     shading = np.maximum(normals @ directions.T, 0) * rng.uniform(0.2, 1, (len(normals), 1))
     half = unit(directions + np.array((0.0, 0.0, 1.0)))
     shading += shine * np.maximum(normals @ half.T, 0) ** 40
     return shading * rng.normal(1, 0.01, shading.shape).clip(0.9, 1.1)
 
 
-@pytest.mark.parametrize("n_lights, shine", [(6, 0.0), (8, 0.0), (8, 0.5)])
+@parametrize("n_lights, shine", [(6, 0.0), (8, 0.0), (8, 0.5)])
 def test_unequal_lights_are_estimated(n_lights, shine):
     directions, intensities = lights(n_lights), INTENSITIES[:n_lights]
-    observations = (textured_sphere(directions, shine=shine) * intensities).astype(np.float32)
+    observations = np.float32(textured_sphere(directions, shine=shine) * intensities)
     found = estimate_light_intensities(observations, None, directions)
-    assert found.mean() == pytest.approx(1)
+    assert found.mean() == approx(1)
     assert_allclose(found, intensities / intensities.mean(), rtol=0.02)
 
 
-@pytest.mark.parametrize("shine", [0.0, 0.5, 3.0])
+@parametrize("shine", [0.0, 0.5, 3.0])
 def test_equal_lights_are_left_alone(shine):
     directions = lights(8)
     assert (
         estimate_light_intensities(
-            textured_sphere(directions, shine=shine).astype(np.float32), None, directions
+            np.float32(textured_sphere(directions, shine=shine)), None, directions
         )
         is None
     )
@@ -162,19 +170,19 @@ def test_scenes_that_do_not_determine_intensities():
         never,
     ):
         directions = lights(observations.shape[1])
-        assert estimate_light_intensities(observations.astype(np.float32), None, directions) is None
+        assert estimate_light_intensities(np.float32(observations), None, directions) is None
 
 
-@pytest.mark.parametrize("widths", [None, 3.0])
-@pytest.mark.parametrize("tilt", [0.0, 0.05])
+@parametrize("widths", [None, 3.0])
+@parametrize("tilt", [0.0, 0.05])
 def test_flat_objects(widths, tilt):
     """A relief whose slopes are around one tenth: with estimated intensities, normals are right but
     for the tilt.
     """
-    rng, size, directions = np.random.default_rng(1), 40, lights(8)
+    rng, size, directions = default_rng(1), 40, lights(8)
     y, x = np.mgrid[1 : -1 : size * 1j, -1 : 1 : size * 1j]
     slopes = (0.1 * np.cos(7 * x + 2 * y) + tilt, 0.1 * np.sin(6 * y))
-    normals = unit(np.stack((*slopes, np.ones_like(x)), axis=2).reshape(-1, 3))
+    normals = tilted(*slopes).reshape(-1, 3)
     vectors = np.broadcast_to(directions, (size**2, 8, 3))
     if widths is not None:
         lamps = NearLamps.of(directions * widths * size, 1.0, (size, size), equal=True)
@@ -183,7 +191,7 @@ def test_flat_objects(widths, tilt):
         )
         vectors = towards * attenuation[..., None]
     shaded = np.einsum("pfc,pc->pf", vectors, normals) * rng.uniform(0.3, 1, (size**2, 1))
-    observations = (shaded * INTENSITIES * rng.normal(1, 0.005, shaded.shape)).astype(np.float32)
+    observations = np.float32(shaded * INTENSITIES * rng.normal(1, 0.005, shaded.shape))
     found = estimate_light_intensities(observations, None, lambda rows: vectors[rows])
 
     def error_deg(intensities):
@@ -192,16 +200,13 @@ def test_flat_objects(widths, tilt):
 
     # The images leave the tilt open, which 0.05 makes 3 degrees.
     assert error_deg(found) < 3 + 60 * tilt < 0.5 * error_deg(np.ones(8))
-    assert (
-        estimate_light_intensities(shaded.astype(np.float32), None, lambda rows: vectors[rows])
-        is None
-    )
+    assert estimate_light_intensities(np.float32(shaded), None, lambda rows: vectors[rows]) is None
 
 
 def test_saturated_observations_do_not_count():
     directions = lights(8)
     truth = textured_sphere(directions) * INTENSITIES
-    stored = np.minimum(truth, 0.6).astype(np.float32)
+    stored = np.float32(np.minimum(truth, 0.6))
     found = estimate_light_intensities(stored, truth >= 0.6, directions)
     assert_allclose(found, INTENSITIES / INTENSITIES.mean(), rtol=0.05)
 
@@ -209,7 +214,7 @@ def test_saturated_observations_do_not_count():
 def test_a_capture_without_a_file_of_intensities(tmp_path):
     directions = lights(8)
     shaded = np.moveaxis(shade(sphere_cap(40, 0.6), directions) * INTENSITIES, 2, 0)
-    write_capture(tmp_path, np.rint(30_000 * shaded).astype(np.uint16), directions)
+    write_capture(tmp_path, np.uint16(np.rint(30_000 * shaded)), directions)
     source = open_capture(tmp_path)
     plain, restored = (
         prepare_capture(source, options=RecipeOptions(as_stored=True)),
@@ -221,15 +226,13 @@ def test_a_capture_without_a_file_of_intensities(tmp_path):
         warning for warning in restored.warnings if warning.code == "estimated_intensities"
     )
     stated = [float(number) for number in re.findall(r"\d\.\d\d", str(warning))]
-    assert stated == pytest.approx([low, high], abs=0.02)
+    assert stated == approx([low, high], abs=0.02)
     assert_allclose(restored.estimated_intensities, INTENSITIES / INTENSITIES.mean(), rtol=0.02)
     assert_allclose(
         restored.observations, plain.observations / restored.estimated_intensities, rtol=1e-5
     )
     some = restored.choose_lights([6, 0, 2])
-    np.testing.assert_array_equal(
-        some.estimated_intensities, restored.estimated_intensities[[6, 0, 2]]
-    )
+    assert_array_equal(some.estimated_intensities, restored.estimated_intensities[[6, 0, 2]])
     # Given intensities replace estimates.
     np.savetxt(tmp_path / "light_intensities.txt", np.ones((8, 3)))
     assert prepare_capture(open_capture(tmp_path)).estimated_intensities is None
@@ -242,7 +245,7 @@ def test_a_capture_without_a_file_of_intensities(tmp_path):
     )
 
 
-@pytest.mark.parametrize("name", ["ballPNG", "catPNG"])
+@parametrize("name", "ballPNG catPNG")
 def test_real_objects_whose_lights_were_measured(shared_data, name):
     """Ten of DiLiGenT's lights, of which the strongest is four to six times the weakest."""
     source = open_capture(shared_data / "DiLiGenT/pmsData" / name)
@@ -250,7 +253,7 @@ def test_real_objects_whose_lights_were_measured(shared_data, name):
     measured = source.light_intensities.mean(axis=1)
     for chosen in draw_lights(capture.light_directions, 10, trials=3, seed=0):
         order, directions = list(chosen), capture.light_directions[list(chosen)]
-        observations = (capture.observations[:, order] * measured[order]).astype(np.float32)
+        observations = np.float32(capture.observations[:, order] * measured[order])
         found = estimate_light_intensities(observations, None, directions)
         ratio = np.log(found / measured[order])
         # Taken for equal, they would be off by 0.4 to 0.5.

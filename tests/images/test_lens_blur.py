@@ -5,9 +5,11 @@ image, is known.
 import cv2
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx
 
-from scenes import shade, sphere_cap, spiral_lights
+from scenes import parametrize, shade, sphere_cap, spiral_lights
 from splinecli.capture.arrays import open_arrays
 from splinecli.images.lens_blur import NOISE, REACH, inverse_filter, remove_blur, surroundings
 from splinecli.recipe import RecipeOptions, prepare_capture
@@ -21,7 +23,7 @@ def discs():
     """Eight images (F, H, W) of bright discs in different places before gray, with the true
     coverage of each pixel.
     """
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     images = np.full((8, FINER * SIDE, FINER * SIDE), 0.2, np.float32)
     for image in images:
         for _ in range(12):
@@ -45,24 +47,20 @@ def removed(images):
     return observations.T.reshape(images.shape), sigma
 
 
-@pytest.mark.parametrize("sigma", [0.5, 0.7, 1.0])
-@pytest.mark.parametrize("noise", [0.0, 0.01])
+@parametrize("sigma", [0.5, 0.7, 1.0])
+@parametrize("noise", [0.0, 0.01])
 def test_a_blur_is_found_and_removed(sigma, noise):
     sharp = discs()
-    soft = blurred(sharp, sigma) + np.float32(noise) * np.random.default_rng(1).normal(
-        size=sharp.shape
-    )
-    found, estimate = removed(soft.astype(np.float32))
-    assert estimate == pytest.approx(sigma, abs=0.2)
+    soft = blurred(sharp, sigma) + np.float32(noise) * default_rng(1).normal(size=sharp.shape)
+    found, estimate = removed(np.float32(soft))
+    assert estimate == approx(sigma, abs=0.2)
     before, after = (np.sqrt(np.square(images - sharp).mean()) for images in (soft, found))
     assert after < before * (0.75 if noise == 0 else 1.1)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.01])
+@parametrize("noise", [0.0, 0.01])
 def test_sharp_images_stay_as_they_are(noise):
-    images = (discs() + noise * np.random.default_rng(1).normal(size=(8, SIDE, SIDE))).astype(
-        np.float32
-    )
+    images = np.float32(discs() + noise * default_rng(1).normal(size=(8, SIDE, SIDE)))
     found, estimate = removed(images)
     assert estimate is None
     assert_array_equal(found, images)
@@ -70,18 +68,16 @@ def test_sharp_images_stay_as_they_are(noise):
 
 def test_fine_texture_stays_as_it_is():
     """Each pixel has an albedo of its own."""
-    rng = np.random.default_rng(2)
-    images = (rng.uniform(0.2, 1, (SIDE, SIDE)) * rng.uniform(0.3, 0.8, (8, 1, 1))).astype(
-        np.float32
-    )
+    rng = default_rng(2)
+    images = np.float32(rng.uniform(0.2, 1, (SIDE, SIDE)) * rng.uniform(0.3, 0.8, (8, 1, 1)))
     assert removed(images)[1] is None
 
 
-@pytest.mark.parametrize("gloss", [0.0, 0.5])
+@parametrize("gloss", [0.0, 0.5])
 def test_images_without_edges_stay_as_they_are(gloss):
     """Shading alone looks like the widest blur."""
     shading = shade(sphere_cap(SIDE), spiral_lights(8, 60), gloss=gloss)
-    assert removed(np.moveaxis(shading, 2, 0).astype(np.float32))[1] is None
+    assert removed(np.float32(np.moveaxis(shading, 2, 0)))[1] is None
     assert removed(np.full((8, SIDE, SIDE), 0.5, np.float32))[1] is None
 
 
@@ -110,7 +106,7 @@ def test_only_the_object_and_what_surrounds_it_is_needed():
     around = surroundings(mask)
     assert not (mask & around).any()
     part = np.concatenate((images[:, mask], images[:, around]), axis=1).T.copy()
-    assert remove_blur(part, mask, around) == pytest.approx(0.7, abs=0.2)
+    assert remove_blur(part, mask, around) == approx(0.7, abs=0.2)
     assert np.array_equal(part[mask.sum() :].T, images[:, around])
     far = np.where(mask | around, images, 7)  # the filter must not see these
     other = np.concatenate((far[:, mask], far[:, around]), axis=1).T.copy()

@@ -1,17 +1,17 @@
 """Wrong light files are told from right ones, on surfaces whose normals are known."""
 
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 import scenes
-from scenes import ring_lights, spiral_lights
-from splinecli.capture.light_rows import PLANE_FRAMES, LightFrame, parse_light_frame
+from scenes import parametrize, refuses, ring_lights, spiral_lights, tilted
+from splinecli.capture.light_rows import PLANE_FRAMES, parse_light_frame
 from splinecli.errors import UsageError
-from splinecli.judge.light_check import LightCheck, check_lights
+from splinecli.judge.light_check import check_lights
 from splinecli.judge.light_order import UNKNOWN_ORDER
 from splinecli.lights.light_fit import find_factors, random_misfits
 from splinecli.maths.normals import unit
@@ -26,12 +26,12 @@ ring = partial(ring_lights, zenith_deg=40, first_rad=0.3)
 shade = partial(scenes.shade, gloss=0.3, noise=0.01)
 
 
-def scattered(count: int = 14) -> Array:
+def scattered(count=14):
     """Lights on a spiral, so that no shift or exchange takes them to each other."""
     return spiral_lights(count, 55, 12)
 
 
-def vase() -> tuple[Array, NDArray[np.bool_]]:
+def vase():
     """The normals (P, 3) of a tilted ellipsoid with a dent, and its mask: z = sqrt(1 - u^2 - 2 v^2)
     - bump.
     """
@@ -43,24 +43,25 @@ def vase() -> tuple[Array, NDArray[np.bool_]]:
         -((x - 0.2) ** 2 + (y - 0.1) ** 2) / 0.05
     )
     z_row, z_x = np.gradient(z, 2 / (SIZE - 1))
-    return unit(np.stack((-z_x, z_row, np.ones_like(z)), axis=2))[inside], inside
+    return tilted(-z_x, z_row)[inside], inside
 
 
-def check_vase(lights: Array, read_as: Array, gloss: float = 0.3) -> LightCheck:
+def check_vase(lights, read_as, gloss=0.3):
     normals, mask = vase()
     return check_lights(scenes.shade(normals, lights, gloss=gloss, noise=0.01), mask, read_as)
 
 
-@pytest.mark.parametrize("lights", [scattered(), scattered(6), ring(8), ring(12)], ids=len)
-def test_right_lights_are_not_doubted(lights: Array) -> None:
+@parametrize("lights", [scattered(), scattered(6), ring(8), ring(12)], ids=len)
+def test_right_lights_are_not_doubted(lights):
     check = check_vase(lights, lights)
-    assert (check.order, check.best) == (None, None)
+    assert check.order is None
+    assert check.best is None
     assert check.given.curl < 0.2
     assert check.given.rim > 0.9
 
 
-@pytest.mark.parametrize("frame", PLANE_FRAMES[1:], ids=str)
-def test_each_wrong_frame_is_named_with_the_frame_that_mends_it(frame: LightFrame) -> None:
+@parametrize("frame", PLANE_FRAMES[1:], ids=str)
+def test_each_wrong_frame_is_named_with_the_frame_that_mends_it(frame):
     lights = scattered()
     # The inverse of the frame writes the file, so that reading it in the frame gives the lights.
     check = check_vase(lights, lights @ np.linalg.inv(frame.matrix).T)
@@ -77,33 +78,32 @@ ORDERS = {
 }
 
 
-@pytest.mark.parametrize("name", list(ORDERS)[1:])
-def test_each_wrong_order_is_named(name: str) -> None:
+@parametrize("name", list(ORDERS)[1:])
+def test_each_wrong_order_is_named(name):
     order, words = ORDERS[name]
     check = check_vase(scattered(), scattered()[order])
-    assert (check.order, check.best) == (words, None)
+    assert check.order == words
+    assert check.best is None
     assert check.given_misfit > 0.3
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("order", "words"),
     [
         (np.roll(np.arange(12), 1), SHIFTED),
         (np.arange(12)[::-1], "in reversed order, beginning with light 12"),
     ],
 )
-def test_a_ring_that_fits_in_every_shift_is_told_by_its_normals(
-    order: NDArray[np.int64], words: str
-) -> None:
+def test_a_ring_that_fits_in_every_shift_is_told_by_its_normals(order, words):
     check = check_vase(ring(12), ring(12)[order])
     assert check.order is None, "a turned ring fits as well"
     assert check.best.name == words
 
 
-def test_a_relief_that_fills_the_picture_has_no_outline() -> None:
+def test_a_relief_that_fills_the_picture_has_no_outline():
     y, x = np.mgrid[0 : 3 : SIZE * 1j, 0 : 3 : SIZE * 1j]
     z_x, z_y = 0.4 * np.cos(2 * x) * np.sin(3 * y), 0.6 * np.sin(2 * x) * np.cos(3 * y)
-    normals = unit(np.stack((-z_x, z_y, np.ones_like(x)), axis=2).reshape(-1, 3))
+    normals = tilted(-z_x, z_y).reshape(-1, 3)
     mask, lights = np.ones((SIZE, SIZE), np.bool_), scattered()
     observations = shade(normals, lights)
     right = check_lights(observations, mask, lights)
@@ -113,7 +113,7 @@ def test_a_relief_that_fills_the_picture_has_no_outline() -> None:
     assert flipped.best.frame.signs[0] != flipped.best.frame.signs[1]
 
 
-def metal(normals: Array, lights: Array) -> Array:
+def metal(normals, lights):
     """A highlight, whose brightness varies from image to image, and hardly any matte reflection."""
     lit = np.clip(normals @ lights.T, 0, None)
     return (
@@ -122,19 +122,15 @@ def metal(normals: Array, lights: Array) -> Array:
     )
 
 
-@pytest.mark.parametrize("name", ["right", "swapped", "shuffled"])
-def test_the_order_of_metal_is_judged(name: str) -> None:
+@parametrize("name", "right swapped shuffled")
+def test_the_order_of_metal_is_judged(name):
     (normals, mask), (order, words) = vase(), ORDERS[name]
     assert check_lights(metal(normals, scattered()), mask, scattered()[order]).order == words
 
 
-def test_on_a_flat_relief_only_known_intensities_tell_the_order() -> None:
+def test_on_a_flat_relief_only_known_intensities_tell_the_order():
     y, x = np.mgrid[0 : 3 : SIZE * 1j, 0 : 3 : SIZE * 1j]
-    normals = unit(
-        np.stack((-0.03 * np.cos(3 * x), 0.03 * np.sin(2 * y), np.ones_like(x)), axis=2).reshape(
-            -1, 3
-        )
-    )
+    normals = tilted(-0.03 * np.cos(3 * x), 0.03 * np.sin(2 * y)).reshape(-1, 3)
     mask, lights = np.ones((SIZE, SIZE), np.bool_), scattered()
     observations = shade(normals, lights)
     for given, known, order in (
@@ -148,7 +144,7 @@ def test_on_a_flat_relief_only_known_intensities_tell_the_order() -> None:
         assert np.isnan(check.given_misfit) == (not known)
 
 
-def test_misfits_are_those_of_least_squares() -> None:
+def test_misfits_are_those_of_least_squares():
     lights = scattered()
     normals, _ = vase()
     observations = np.clip(normals @ lights.T, 0, None)
@@ -165,51 +161,48 @@ def test_misfits_are_those_of_least_squares() -> None:
     assert random_misfits(factors, lights).min() > 0.01
 
 
-def test_the_columns_of_an_exchanged_file() -> None:
+def test_the_columns_of_an_exchanged_file():
     # The file has y before x, and its y points down: (y, x, z) = (0.2, 0.5, 0.8) is x = 0.5, y =
     # -0.2.
     frame = parse_light_frame("swap-xy, y-down")
-    np.testing.assert_array_equal(np.array((0.2, 0.5, 0.8)) @ frame.matrix.T, (0.5, -0.2, 0.8))
+    assert_array_equal(np.array((0.2, 0.5, 0.8)) @ frame.matrix.T, (0.5, -0.2, 0.8))
     assert frame.describe() == "x and y exchanged, y negated"
 
 
-@pytest.mark.parametrize("text", ["down", "y-down,y-up", ""])
-def test_refused_frames(text: str) -> None:
-    with pytest.raises(UsageError, match="--light-frame is"):
+@parametrize("text", ["down", "y-down,y-up", ""])
+def test_refused_frames(text):
+    with refuses("--light-frame is", UsageError):
         parse_light_frame(text)
 
 
-@pytest.mark.parametrize(
-    "name", ["DiLiGenT/pmsData/ballPNG", "DiLiGenT/pmsData/catPNG", "uw/gray", "uw/horse"]
-)
-def test_real_captures(shared_data: Path, name: str) -> None:
+@parametrize("name", "DiLiGenT/pmsData/ballPNG DiLiGenT/pmsData/catPNG uw/gray uw/horse")
+def test_real_captures(shared_data, name):
     chosen = None if "uw" in name else list(range(3, 96, 7))
     capture = read_capture(shared_data / name, light_indices=chosen)
     lights = capture.light_directions
     right = check_lights(capture.observations, capture.mask, lights)
-    assert (right.order, right.best, right.odd_image) == (None, None, None)
+    assert right.order is None
+    assert right.best is None
+    assert right.odd_image is None
     flipped = check_lights(capture.observations, capture.mask, lights * (1, -1, 1))
     assert flipped.best is not None and str(flipped.best.frame) == "y-down"
 
 
-def test_a_few_outshining_pixels_do_not_hide_the_object() -> None:
+def test_a_few_outshining_pixels_do_not_hide_the_object():
     normals, _ = vase()
     observations = shade(normals, scattered())
     observations[::100] *= 40  # mirror-like highlights
-    factors = find_factors(observations)
-    assert factors.misfits(scattered()[None])[0] < 0.05
+    assert find_factors(observations).misfits(scattered()[None])[0] < 0.05
 
 
-@pytest.mark.parametrize("shape", [(1, 60), (60, 1), (1, 1)])
-def test_a_line_of_pixels_tells_no_frame(shape: tuple[int, int]) -> None:
-    generator = np.random.default_rng(0)
-    lights = unit(generator.normal((0, 0, 1), 0.3, (12, 3)))
-    normals = unit(generator.normal((0, 0, 1), 0.2, (shape[0] * shape[1], 3)))
-    check = check_lights((normals @ lights.T).clip(0), np.ones(shape, bool), lights)
-    assert check.best is None
+@parametrize("shape", [(1, 60), (60, 1), (1, 1)])
+def test_a_line_of_pixels_tells_no_frame(shape, rng):
+    lights = unit(rng.normal((0, 0, 1), 0.3, (12, 3)))
+    normals = unit(rng.normal((0, 0, 1), 0.2, (shape[0] * shape[1], 3)))
+    assert check_lights((normals @ lights.T).clip(0), np.ones(shape, bool), lights).best is None
 
 
-def dome(*counts: int) -> Array:
+def dome(*counts):
     """Lights in rings of so many lamps, from low to high, each turned by ten degrees against the
     one below.
     """
@@ -221,11 +214,9 @@ def dome(*counts: int) -> Array:
     return np.concatenate(list(rings))
 
 
-@pytest.mark.parametrize("frame", [(1, 1, 1), (-1, 1, 1)], ids=["in its frame", "x negated"])
-@pytest.mark.parametrize("counts", [(12, 12, 12, 12), (16, 12, 8), (8, 6)], ids=str)
-def test_rings_that_begin_at_another_lamp(
-    counts: tuple[int, ...], frame: tuple[int, int, int]
-) -> None:
+@parametrize("frame", [(1, 1, 1), (-1, 1, 1)], ids=["in its frame", "x negated"])
+@parametrize("counts", [(12, 12, 12, 12), (16, 12, 8), (8, 6)], ids=str)
+def test_rings_that_begin_at_another_lamp(counts, frame):
     lights = dome(*counts)
     read_as, ends = lights.copy(), np.cumsum(counts)
     for start, stop in list(zip(ends - counts, ends, strict=True))[1::2]:
@@ -235,18 +226,20 @@ def test_rings_that_begin_at_another_lamp(
         check.order is not None
         and f"lights {counts[0] + 1} to {counts[0] + counts[1]}" in check.order
     )
-    np.testing.assert_allclose(check.mended, lights, atol=1e-6)
+    assert_allclose(check.mended, lights, atol=1e-6)
 
 
-def test_a_ring_that_runs_the_other_way_round() -> None:
+def test_a_ring_that_runs_the_other_way_round():
     lights = dome(12, 12, 12)
     check = check_vase(lights, np.concatenate((lights[:12], lights[12:24][::-1], lights[24:])))
     assert check.order == "with lights 13 to 24 reversed"
-    np.testing.assert_allclose(check.mended, lights, atol=1e-6)
+    assert_allclose(check.mended, lights, atol=1e-6)
 
 
-@pytest.mark.parametrize("counts", [(12, 12, 12, 12), (16, 12, 8), (8, 6)], ids=str)
-@pytest.mark.parametrize("gloss", [0.0, 0.3, 0.8])
-def test_right_rings_are_not_doubted(counts: tuple[int, ...], gloss: float) -> None:
+@parametrize("counts", [(12, 12, 12, 12), (16, 12, 8), (8, 6)], ids=str)
+@parametrize("gloss", [0.0, 0.3, 0.8])
+def test_right_rings_are_not_doubted(counts, gloss):
     check = check_vase(dome(*counts), dome(*counts), gloss)
-    assert (check.order, check.best, check.mended) == (None, None, None)
+    assert check.order is None
+    assert check.best is None
+    assert check.mended is None

@@ -3,17 +3,15 @@ lamps and light.
 """
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
+from pytest import approx
 
 from judged import warnings_of
-from scenes import ring_lights, shade, spiral_lights, square_grid
+from scenes import as_capture, parametrize, ring_lights, shade, spiral_lights, square_grid, tilted
 from scenes import sphere as ball
-from splinecli.capture import Capture
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.images.lamps import estimate_light_intensities
 from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.records.capture_warnings import CaptureWarning
 
 Array = NDArray[np.float64]
 SIZE = 48
@@ -26,7 +24,7 @@ LIGHTS = {
 CODES = {"nonlinearity_suspected", "near_lights_suspected", "constant_light", "unequal_intensities"}
 
 
-def surface(shape: str) -> tuple[Array, NDArray[np.bool_]]:
+def surface(shape):
     """Return normals (P, 3) and the mask (SIZE, SIZE) of a ball, of bumps over the picture, or of a
     tilted plate.
     """
@@ -36,14 +34,10 @@ def surface(shape: str) -> tuple[Array, NDArray[np.bool_]]:
         return normals[mask], mask
     slopes = {"bumps": (0.5 * np.cos(5 * x) * np.cos(4 * y), -0.4 * np.sin(5 * x) * np.sin(4 * y))}
     across = slopes.get(shape, (0.3 + 0 * x, 0.15 + 0 * x))
-    return unit(np.stack((*across, np.ones_like(x)), axis=2)).reshape(-1, 3), np.ones(
-        x.shape, np.bool_
-    )
+    return tilted(*across).reshape(-1, 3), np.ones(x.shape, np.bool_)
 
 
-def values(
-    shape: str, lights: Array, *, gloss: float = 0.0, constant: float = 0.0, noise: float = 0.002
-) -> Array:
+def values(shape, lights, *, gloss=0.0, constant=0.0, noise=0.002):
     """Return observations (P, F), the largest 1, of a surface with a random albedo, also under
     constant light.
     """
@@ -57,20 +51,17 @@ def values(
     return np.asarray((shaded / shaded.max() + rng.normal(0, noise, shaded.shape)).clip(0, 1))
 
 
-def encode(linear: Array, bits: int = 16) -> Array:
+def encode(linear, bits=16):
     srgb = np.where(
         linear < 0.0031308, 12.92 * linear, 1.055 * linear.clip(1e-9) ** (1 / 2.4) - 0.055
     )
     return np.rint(srgb * (2**bits - 1)) / (2**bits - 1)
 
 
-def found(
-    shape: str, observed: Array, lights: Array, intensities: Array | None = None
-) -> list[CaptureWarning]:
+def found(shape, observed, lights, intensities=None):
     if intensities is not None:
         observed = observed / intensities
-    mask = surface(shape)[1]
-    capture = Capture("scene", observed.astype(np.float32), lights, tuple(range(len(lights))), mask)
+    capture = as_capture(observed, lights, surface(shape)[1])
     return [
         warning
         for warning in warnings_of(capture, intensities=intensities)
@@ -78,7 +69,7 @@ def found(
     ]
 
 
-def error_of(observed: Array, lights: Array, shape: str) -> float:
+def error_of(observed, lights, shape):
     """Return the mean error of the brightest pixels' least squares, which is what the wrong reading
     costs.
     """
@@ -87,32 +78,30 @@ def error_of(observed: Array, lights: Array, shape: str) -> float:
     return float(np.median(angle_between_deg(fitted, surface(shape)[0][lit])))
 
 
-@pytest.mark.parametrize("lights", LIGHTS)
-@pytest.mark.parametrize("shape", ["ball", "bumps", "plate"])
-@pytest.mark.parametrize("gloss", [0.0, 0.2])
-def test_right_captures_are_not_doubted(shape: str, lights: str, gloss: float) -> None:
+@parametrize("lights", LIGHTS)
+@parametrize("shape", "ball bumps plate")
+@parametrize("gloss", [0.0, 0.2])
+def test_right_captures_are_not_doubted(shape, lights, gloss):
     assert found(shape, values(shape, LIGHTS[lights], gloss=gloss), LIGHTS[lights]) == []
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("shape", "lights"),
     [*(("ball", lights) for lights in LIGHTS), ("bumps", "two rings"), ("bumps", "spiral")],
 )
-@pytest.mark.parametrize("known", [False, True])
-def test_encoded_values(shape: str, lights: str, known: bool) -> None:
+@parametrize("known", [False, True])
+def test_encoded_values(shape, lights, known):
     directions = LIGHTS[lights]
     intensities = np.linspace(0.7, 1.3, len(directions)) if known else None
     linear = values(shape, directions) * (1 if intensities is None else intensities)
     (warning,) = found(shape, encode(linear / linear.max()), directions, intensities)
     assert warning.code == "nonlinearity_suspected" and "--transfer srgb" in warning.text
     if not known:
-        assert warning.error_deg == pytest.approx(
-            error_of(encode(linear), directions, shape), rel=0.35
-        )
+        assert warning.error_deg == approx(error_of(encode(linear), directions, shape), rel=0.35)
 
 
-@pytest.mark.parametrize("lights", LIGHTS)
-def test_a_flat_object_is_not_accused_of_another_fault(lights: str) -> None:
+@parametrize("lights", LIGHTS)
+def test_a_flat_object_is_not_accused_of_another_fault(lights):
     """Its pixels repeat each other, so that its images hardly determine how to read them."""
     directions = LIGHTS[lights]
     linear = values("plate", directions)
@@ -120,31 +109,24 @@ def test_a_flat_object_is_not_accused_of_another_fault(lights: str) -> None:
         assert found("plate", observed, directions) == []
 
 
-def test_a_curve_behind_unequal_lamps() -> None:
+def test_a_curve_behind_unequal_lamps():
     intensities = np.array([0.5, 1.0, 1.6, 0.8, 1.2, 0.7, 1.4, 0.9, 1.1, 0.6])
     linear = values("ball", LIGHTS["spiral"]) * intensities
-    directions, mask = LIGHTS["spiral"], surface("ball")[1]
+    directions = LIGHTS["spiral"]
     for observed, expected in (
         (linear, set()),
         (encode(linear / linear.max()), {"nonlinearity_suspected"}),
     ):
-        values_seen = observed.astype(np.float32)
-        estimated = estimate_light_intensities(values_seen, None, directions)
-        capture = Capture(
-            "ball",
-            values_seen / estimated.astype(np.float32),
-            directions,
-            tuple(range(10)),
-            mask,
-            estimated_intensities=estimated,
+        estimated = estimate_light_intensities(np.float32(observed), None, directions)
+        capture = as_capture(
+            observed / estimated, directions, surface("ball")[1], estimated_intensities=estimated
         )
-        codes = CODES & {warning.code for warning in warnings_of(capture)}
-        assert codes == expected
+        assert CODES & {warning.code for warning in warnings_of(capture)} == expected
 
 
-@pytest.mark.parametrize("widths", [1.5, 2.0, 3.0, 4.0])
-@pytest.mark.parametrize("shape", ["ball", "bumps", "plate"])
-def test_near_lamps(shape: str, widths: float) -> None:
+@parametrize("widths", [1.5, 2.0, 3.0, 4.0])
+@parametrize("shape", "ball bumps plate")
+def test_near_lamps(shape, widths):
     directions, (normals, mask) = LIGHTS["spiral"], surface(shape)
     lamps = NearLamps.of(
         directions * widths * np.ptp(np.flatnonzero(mask.any(axis=0))), 1.0, mask.shape, equal=True
@@ -155,35 +137,33 @@ def test_near_lamps(shape: str, widths: float) -> None:
     assert warning.code == "near_lights_suspected" and warning.error_deg is not None
     # An error of a quarter of the distance costs 2 to 4 degrees, where distant lights cost 6 to 20.
     stated = float(warning.text.split("--light-distance ")[1].split()[0])
-    assert stated == pytest.approx(widths, rel=0.26)
+    assert stated == approx(widths, rel=0.26)
 
 
-@pytest.mark.parametrize("lights", LIGHTS)
-@pytest.mark.parametrize("share", [0.2, 1.0])
-def test_constant_light(lights: str, share: float) -> None:
+@parametrize("lights", LIGHTS)
+@parametrize("share", [0.2, 1.0])
+def test_constant_light(lights, share):
     (warning,) = found("ball", values("ball", LIGHTS[lights], constant=share), LIGHTS[lights])
     assert warning.code == "constant_light" and "--ambient" in warning.text
 
 
-@pytest.mark.parametrize("lights", ["two rings", "spiral"])
-def test_a_relief_under_constant_light_looks_translucent(lights: str) -> None:
+@parametrize("lights", ["two rings", "spiral"])
+def test_a_relief_under_constant_light_looks_translucent(lights):
     """Light that enters a material softens its shading in the same way."""
-    observed, mask = values("bumps", LIGHTS[lights], constant=0.2), surface("bumps")[1]
     directions = LIGHTS[lights]
-    capture = Capture(
-        "wax", observed.astype(np.float32), directions, tuple(range(len(directions))), mask
-    )
+    observed = values("bumps", directions, constant=0.2)
+    capture = as_capture(observed, directions, surface("bumps")[1])
     (warning,) = [each for each in warnings_of(capture) if each.code != "few_lights"]
     assert warning.code == "unknown_material" and warning.error_deg
 
 
-def test_constant_light_under_four_lights() -> None:
+def test_constant_light_under_four_lights():
     lights = ring_lights(4, 45)
     (warning,) = found("ball", values("ball", lights, constant=6, noise=0.0005), lights)
     assert warning.code == "constant_light" and (warning.error_deg or 0) > 20
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("words", "given"),
     [
         ("inverted", lambda e: 1 / e),
@@ -191,7 +171,7 @@ def test_constant_light_under_four_lights() -> None:
         ("left out", lambda e: np.ones_like(e)),
     ],
 )
-def test_wrong_intensities(words: str, given) -> None:
+def test_wrong_intensities(words, given):
     intensities = np.array([0.8, 1.0, 1.2, 0.8, 1.1, 0.7, 1.3, 0.9, 1.1, 0.95])
     truth = np.ones(10) if words == "left out" else intensities
     stated = intensities if words == "left out" else given(intensities)
@@ -201,19 +181,13 @@ def test_wrong_intensities(words: str, given) -> None:
     assert warning.code == "unequal_intensities" and words in warning.text
 
 
-def test_too_little_is_not_judged() -> None:
+def test_too_little_is_not_judged():
     few, black = values("bumps", LIGHTS["spiral"])[:30], np.zeros((400, 10))
     for observed, shape in ((few, (5, 6)), (black, (20, 20))):
-        capture = Capture(
-            "few",
-            observed.astype(np.float32),
-            LIGHTS["spiral"],
-            tuple(range(10)),
-            np.ones(shape, np.bool_),
-        )
+        capture = as_capture(observed, LIGHTS["spiral"], np.ones(shape, np.bool_))
         assert not CODES & {warning.code for warning in warnings_of(capture)}
 
 
-def test_clipped_values_are_no_curve() -> None:
+def test_clipped_values_are_no_curve():
     lights = LIGHTS["spiral"]
     assert found("ball", np.minimum(values("ball", lights), 0.75), lights, np.ones(10)) == []

@@ -1,30 +1,28 @@
 """Lights that are all tilted together."""
 
 import numpy as np
-import pytest
+from pytest import approx
 from scipy.spatial.transform import Rotation
 
-from scenes import cap_directions, sphere
+from scenes import cap_directions, parametrize, sphere, tilted
 from splinecli.judge.tilt import curl_of, find_tilt, fitted_map
-from splinecli.maths.normals import unit
+from splinecli.maths.normals import angle_between_deg
 
 SIZE = 72
 LIGHTS = cap_directions(12, 50, 3, even=True)
 
 
-def surface(name: str) -> tuple[np.ndarray, np.ndarray]:
+def surface(name):
     if name == "bumps":
         y, x = np.mgrid[:SIZE, :SIZE] / SIZE * 9
         heights = np.sin(x) * np.cos(0.7 * y) + 0.6 * np.sin(1.3 * x + 2 * y)
         down, right = np.gradient(heights * 5)
-        return unit(np.dstack((-right, down, np.ones_like(x))).reshape(-1, 3)), np.ones(
-            (SIZE, SIZE), bool
-        )
+        return tilted(-right, down).reshape(-1, 3), np.ones((SIZE, SIZE), bool)
     normals, inside = sphere(SIZE)
-    return normals[inside].astype(np.float64), inside
+    return np.float64(normals[inside]), inside
 
 
-def turned(degrees: float, towards_deg: float) -> np.ndarray:
+def turned(degrees, towards_deg):
     """Return the lights tilted by so many degrees towards an azimuth."""
     azimuth = np.radians(towards_deg)
     # The view axis turns towards (cos, sin) about an axis at a right angle to it.
@@ -32,21 +30,21 @@ def turned(degrees: float, towards_deg: float) -> np.ndarray:
     return Rotation.from_rotvec(axis).apply(LIGHTS)
 
 
-@pytest.mark.parametrize("name", ["bumps", "ball"])
-@pytest.mark.parametrize(("degrees", "towards_deg"), [(10, 40), (15, 200), (30, 310)])
+@parametrize("name", "bumps ball")
+@parametrize(("degrees", "towards_deg"), [(10, 40), (15, 200), (30, 310)])
 def test_a_tilt_is_found_and_undone(name, degrees, towards_deg):
     normals, mask = surface(name)
     observed, given = (normals @ LIGHTS.T).clip(0), turned(degrees, towards_deg)
     tilt = find_tilt(fitted_map(observed, mask, given), mask)
-    assert tilt.degrees == pytest.approx(degrees, abs=2.5)
+    assert tilt.degrees == approx(degrees, abs=2.5)
     assert abs((tilt.towards_deg - towards_deg + 180) % 360 - 180) < 15
-    assert np.degrees(np.arccos((given @ tilt.matrix.T * LIGHTS).sum(axis=1).clip(-1, 1))).max() < 3
-    assert tilt.curl * tilt.left == pytest.approx(
+    assert angle_between_deg(given @ tilt.matrix.T, LIGHTS).max() < 3
+    assert tilt.curl * tilt.left == approx(
         curl_of(fitted_map(observed, mask, LIGHTS), mask), abs=0.02
     )
 
 
-@pytest.mark.parametrize("name", ["bumps", "ball"])
+@parametrize("name", "bumps ball")
 def test_right_lights_are_not_tilted(name):
     normals, mask = surface(name)
     tilt = find_tilt(fitted_map((normals @ LIGHTS.T).clip(0), mask, LIGHTS), mask)

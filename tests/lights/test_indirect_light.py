@@ -9,11 +9,10 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
-import pytest
 import torch
-from numpy.typing import NDArray
+from pytest import approx
 
-from scenes import directions_at
+from scenes import directions_at, parametrize, pinhole
 from splinecli.capture import Capture
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.estimate.inference import estimate_normals
@@ -21,7 +20,7 @@ from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.estimate.networks.refine_net import channels
 from splinecli.estimate.refinement.refiner import NetworkRefiner
 from splinecli.lights import lighting
-from splinecli.lights.lighting import IndirectLight, PixelLighting, find_indirect_light
+from splinecli.lights.lighting import PixelLighting, find_indirect_light
 from splinecli.maths.normals import angle_between_deg
 from splinecli.workshop.training.refinement import pixel_features
 
@@ -42,35 +41,30 @@ EVERYWHERE = np.arange(len(BOWL))
 INSIDE = np.hypot(X, Y)[MASK] < 0.8
 """The pixels but for the rim, which lies between a block and none."""
 
-Floats = NDArray[np.float32]
-
 
 def direct_and_indirect(
-    normals: NDArray[np.floating],
-    directions: NDArray[np.floating] = LIGHTS,
-    strengths: NDArray[np.floating] | float = 1.0,
-) -> tuple[Floats, Floats]:
+    normals,
+    directions=LIGHTS,
+    strengths=1.0,
+):
     """Return the light (P, F) that a checkered matte bowl reflects from the lamps,
     and from itself.
     """
-    cosines = (normals[:, None] * directions).sum(-1).clip(0)
-    direct = ALBEDO * cosines * strengths
+    direct = ALBEDO * (normals[:, None] * directions).sum(-1).clip(0) * strengths
     arriving = (SHARE * direct).sum(axis=0) / (1 - (SHARE * ALBEDO).sum())
-    return direct.astype(np.float32), (ALBEDO * arriving).astype(np.float32)
+    return np.float32(direct), np.float32(ALBEDO * arriving)
 
 
 DIRECT, INDIRECT = direct_and_indirect(BOWL)
 CAPTURE = Capture("bowl", DIRECT + INDIRECT, LIGHTS, tuple(range(10)), MASK)
 
 
-def found_in(
-    normals: NDArray[np.floating], observations: Floats, lights: NDArray[np.floating] = LIGHTS
-) -> IndirectLight | None:
+def found_in(normals, observations, lights=LIGHTS):
     return find_indirect_light(
         MASK,
         observations,
         lambda rows: PixelLighting(observations[rows], lights),
-        normals.astype(np.float32),
+        np.float32(normals),
     )
 
 
@@ -78,15 +72,13 @@ def test_a_bowls_light_on_itself_is_found_at_any_exposure():
     direct, indirect = 5 * DIRECT, 5 * INDIRECT
     found = found_in(BOWL, direct + indirect)
     ratio = (found.at(EVERYWHERE) / indirect)[INSIDE]
-    assert ratio.mean() == pytest.approx(1, abs=0.05)
+    assert ratio.mean() == approx(1, abs=0.05)
     assert ratio.std() < 0.05
     left = found.remove(direct + indirect, EVERYWHERE)
     assert np.abs(left - direct)[INSIDE].mean() < 0.1 * indirect.mean()
 
 
-@pytest.mark.parametrize(
-    "camera_matrix", [None, np.array(((200, 0, 31.5), (0, 200, 31.5), (0, 0, 1.0)))]
-)
+@parametrize("camera_matrix", [None, pinhole(200, 31.5, 31.5)])
 def test_it_is_found_under_near_lamps(camera_matrix):
     points = np.stack((X[MASK], Y[MASK], -BOWL[:, 2]), axis=1)
     points[:, 2] -= points[:, 2].mean()
@@ -94,15 +86,15 @@ def test_it_is_found_under_near_lamps(camera_matrix):
     lamps = NearLamps.of(
         distances * LIGHTS, 2 / SIZE, (SIZE, SIZE), equal=False, camera_matrix=camera_matrix
     )
-    lamps = replace(lamps, points=points.astype(np.float32))
+    lamps = replace(lamps, points=np.float32(points))
     direct, indirect = direct_and_indirect(BOWL, *lamps.light_at(points))
     seen = direct + indirect
 
     def lighting_at(rows):
         return PixelLighting.of(seen[rows], lamps.choose_pixels(rows))
 
-    found = find_indirect_light(MASK, seen, lighting_at, BOWL.astype(np.float32))
-    assert (found.at(EVERYWHERE) / indirect)[INSIDE].mean() == pytest.approx(1, abs=0.05)
+    found = find_indirect_light(MASK, seen, lighting_at, np.float32(BOWL))
+    assert (found.at(EVERYWHERE) / indirect)[INSIDE].mean() == approx(1, abs=0.05)
 
 
 def test_a_dark_background_changes_nothing():
@@ -118,7 +110,7 @@ def test_a_dark_background_changes_nothing():
         mask, observations, lambda rows: PixelLighting(observations[rows], LIGHTS), normals
     )
     ratio = found.at(np.flatnonzero(place)) / alone.at(EVERYWHERE)
-    assert ratio[INSIDE].mean() == pytest.approx(1, abs=0.05)
+    assert ratio[INSIDE].mean() == approx(1, abs=0.05)
 
 
 def test_a_ball_receives_none_even_with_ambient_light():
@@ -128,23 +120,22 @@ def test_a_ball_receives_none_even_with_ambient_light():
 
 
 def test_ambient_light_is_separated_from_indirect_light():
-    found = found_in(BOWL, DIRECT + INDIRECT + (0.03 * ALBEDO).astype(np.float32))
-    assert (found.at(EVERYWHERE) / INDIRECT)[INSIDE].mean() == pytest.approx(1, abs=0.15)
+    found = found_in(BOWL, DIRECT + INDIRECT + np.float32(0.03 * ALBEDO))
+    assert (found.at(EVERYWHERE) / INDIRECT)[INSIDE].mean() == approx(1, abs=0.15)
 
 
-def test_nothing_is_removed_where_shadows_do_not_show_it():
+def test_nothing_is_removed_where_shadows_do_not_show_it(rng):
     """Black shadows, as in a bowl that reflects into one direction only; and shadows that follow
     something else.
     """
     assert found_in(BOWL, DIRECT) is None
-    noise = np.random.default_rng(0).random(DIRECT.shape, np.float32) / ALBEDO.astype(np.float32)
+    noise = rng.random(DIRECT.shape, np.float32) / np.float32(ALBEDO)
     assert found_in(BOWL, np.where(DIRECT > 0, DIRECT, INDIRECT * noise)) is None
     assert found_in(BOWL, np.zeros_like(DIRECT)) is None
 
 
 def test_no_more_is_removed_than_the_brightest_albedo_allows():
-    found = found_in(BOWL, DIRECT + 20 * INDIRECT)
-    assert 1.3 < found.albedo.max() < 1.6
+    assert 1.3 < found_in(BOWL, DIRECT + 20 * INDIRECT).albedo.max() < 1.6
 
 
 def test_shipped_weights_estimate_a_bowl_better_without_its_own_light():

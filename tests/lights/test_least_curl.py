@@ -1,10 +1,10 @@
 """Lights of matte surfaces of known shape, up to the choice of bump or hollow."""
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
-from scenes import cap_directions, sphere
+from scenes import cap_directions, parametrize, sphere, tilted, vectors
 from splinecli.estimate.light_descent import best_lights
 from splinecli.lights.least_curl import (
     Lights,
@@ -18,44 +18,43 @@ from splinecli.maths.normals import unit
 SIZE = 64
 
 
-def bumps() -> tuple[np.ndarray, np.ndarray]:
+def bumps():
     """Return the normals (P, 3) and the mask of a relief that fills the image."""
     y, x = np.mgrid[:SIZE, :SIZE] / SIZE * 9
     down, right = np.gradient(5 * np.sin(x) * np.cos(0.7 * y) + 3 * np.sin(1.3 * x + 2 * y))
-    normals = np.dstack((-right, down, np.ones_like(x))).reshape(-1, 3)
-    return unit(normals), np.ones((SIZE, SIZE), np.bool_)
+    normals = tilted(-right, down).reshape(-1, 3)
+    return normals, np.ones((SIZE, SIZE), np.bool_)
 
 
 def test_normals_of_a_surface_have_no_curl_and_turned_ones_do():
     normals, mask = bumps()
-    vectors = normal_derivatives(normals.reshape(SIZE, SIZE, 3), mask, most=1000)
+    derivatives = normal_derivatives(normals.reshape(SIZE, SIZE, 3), mask, most=1000)
     matrices = np.stack(
         (
             np.eye(3),
             # a generalised bas-relief transformation of normals
-            np.linalg.inv(np.array(((1, 0, 0), (0, 1, 0), (0.2, -0.1, 0.7)))).T,
+            np.linalg.inv(vectors("1 0 0; 0 1 0; 0.2 -0.1 0.7")).T,
             Rotation.from_euler("x", 20, degrees=True).as_matrix(),
             Rotation.from_euler("z", 30, degrees=True).as_matrix(),
         )
     )
-    curls = curl_terms(vectors, matrices, least_z=0.05, least_share=0.5).sum(axis=1)
+    curls = curl_terms(derivatives, matrices, least_z=0.05, least_share=0.5).sum(axis=1)
     assert curls[:2].max() < 0.02
     assert curls[2:].min() > 0.07
 
 
-@pytest.mark.parametrize("spread", [0.0, 0.1])
+@parametrize("spread", [0.0, 0.1])
 def test_a_relief_shows_its_lights_whatever_the_guess(spread):
     """A guess that is 40 degrees off does not matter, but lamps that differ by a tenth do."""
     normals, mask = bumps()
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     true = cap_directions(12, 50, 3, even=True)
     intensities = np.exp(spread * rng.normal(size=12))
     intensities /= intensities.mean()
     albedo = np.where(np.arange(len(normals)) % 96 < 40, 0.3, 0.8)[:, None]
     images = albedo * (normals @ true.T).clip(0) * intensities
     images += 0.002 * rng.normal(size=images.shape)
-    turn = Rotation.from_euler("xz", (25, 35), degrees=True)
-    guess = Lights(turn.apply(true), np.ones(12))
+    guess = Lights(Rotation.from_euler("xz", (25, 35), degrees=True).apply(true), np.ones(12))
     found = lights_of_least_curl(
         images.clip(0), mask, guess, np.full(12, 25.0), intensities_known=not spread
     )
@@ -79,7 +78,7 @@ def test_the_network_expects_smaller_errors_under_lights_nearer_to_the_true_ones
     half = unit(true + np.array((0, 0, 1)))
     shading = (normals[mask] @ true.T).clip(0)
     images = shading + 0.4 * shading**0.1 * (normals[mask] @ half.T).clip(0) ** 60
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     start = unit(true @ Rotation.from_euler("x", 8, degrees=True).as_matrix().T)
     start = unit(start + 0.06 * rng.normal(size=start.shape))
     far = np.roll(true, 3, axis=0)  # in a wrong order

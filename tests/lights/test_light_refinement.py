@@ -1,36 +1,34 @@
 """Refined lights on made-up pixels, whose true lights are known."""
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 
-from scenes import Floats
-from splinecli.capture import Capture
+from scenes import as_capture, parametrize, refuses
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.errors import UsageError
 from splinecli.lights.light_fit import find_factors, refine_capture, refine_lights, would_refine
 from splinecli.maths.normals import angle_between_deg, unit
 
 
-def rough(lights: Floats, sigma_deg: float, seed: int = 0) -> Floats:
+def rough(lights, sigma_deg, seed=0):
     """Lights with Gaussian errors across each, whose angle has this root mean square."""
-    errors = np.random.default_rng(seed).normal(
-        scale=np.radians(sigma_deg) / np.sqrt(2), size=lights.shape
-    )
+    errors = default_rng(seed).normal(scale=np.radians(sigma_deg) / np.sqrt(2), size=lights.shape)
     return unit(lights + errors - (errors * lights).sum(axis=1, keepdims=True) * lights)
 
 
-def aligned_error_deg(found: Floats, true: Floats) -> float:
+def aligned_error_deg(found, true):
     """The mean angle after the best common rotation, which the images leave open."""
     u, _, v = np.linalg.svd(found.T @ true)
     rotation = u @ np.diag((1, 1, np.linalg.det(u @ v))) @ v
     return float(angle_between_deg(unit(found @ rotation), true).mean())
 
 
-@pytest.mark.parametrize("sigma_deg", [4.0, 8.0])
+@parametrize("sigma_deg", [4.0, 8.0])
 def test_matte_pixels_determine_lights_up_to_a_rotation(sigma_deg, matte_pixels):
     _, lights, observations = matte_pixels
     given = rough(lights, sigma_deg)
-    found = refine_lights(observations.astype(np.float32), given, error_deg=sigma_deg)
+    found = refine_lights(np.float32(observations), given, error_deg=sigma_deg)
     assert aligned_error_deg(given, lights) > 0.4 * sigma_deg
     assert aligned_error_deg(found.directions, lights) < 0.1
     # The common rotation is that of the mean of 12 errors.
@@ -38,7 +36,7 @@ def test_matte_pixels_determine_lights_up_to_a_rotation(sigma_deg, matte_pixels)
         angle_between_deg(found.directions, lights).mean()
         < 0.7 * angle_between_deg(given, lights).mean()
     )
-    np.testing.assert_allclose(found.intensities, 1, atol=1e-6)
+    assert_allclose(found.intensities, 1, atol=1e-6)
 
 
 def test_a_light_that_no_pixel_shows_stays(matte_pixels):
@@ -52,11 +50,9 @@ def test_a_light_that_no_pixel_shows_stays(matte_pixels):
 
 def test_unknown_intensities_are_refined_too(matte_pixels):
     _, lights, observations = matte_pixels
-    strengths = np.random.default_rng(3).uniform(0.85, 1.15, 12)
+    strengths = default_rng(3).uniform(0.85, 1.15, 12)
     given = rough(lights, 4.0)
-    found = refine_lights(
-        (observations * strengths).astype(np.float32), given, intensities_known=False
-    )
+    found = refine_lights(np.float32(observations * strengths), given, intensities_known=False)
     relative = found.intensities / strengths
     # Nine common factors are open, which the prior alone holds.
     assert np.std(relative / relative.mean()) < 0.8 * np.std(strengths)
@@ -70,8 +66,7 @@ def test_exact_lights_stay(glossy_pixels):
     pixels or lights.
     """
     normals, lights, observations = glossy_pixels
-    many = np.tile(observations, (3, 1)).astype(np.float32)
-    found = refine_lights(many, lights)
+    found = refine_lights(np.float32(np.tile(observations, (3, 1))), lights)
     assert found is None or angle_between_deg(found.directions, lights).mean() < 1.0
     matte = (0.5 * (normals @ lights.T).clip(min=0)).astype(np.float32)
     given = rough(lights, 4.0)
@@ -80,7 +75,7 @@ def test_exact_lights_stay(glossy_pixels):
     assert refine_lights(np.tile(matte, (3, 1))[:, :5], given[:5]) is None
 
 
-@pytest.mark.parametrize("known", [True, False])
+@parametrize("known", [True, False])
 def test_refinement_is_suggested_for_rough_lights_alone(known, glossy_pixels):
     _, lights, observations = glossy_pixels
     strengths = 1.0 if known else np.linspace(0.6, 1.4, len(lights))
@@ -94,26 +89,15 @@ def test_refinement_is_suggested_for_rough_lights_alone(known, glossy_pixels):
 def test_a_capture_says_what_was_done(matte_pixels):
     _, lights, observations = matte_pixels
     given = rough(lights, 4.0)
-    capture = Capture(
-        "one", observations.astype(np.float32), given, tuple(range(12)), np.ones((10, 20), bool)
-    )
+    capture = as_capture(observations, given, np.ones((10, 20), bool))
     refined = refine_capture(capture)
     assert refined.warnings[-1].code == "refined_lights"
     assert not np.array_equal(refined.light_directions, given)
     again = refine_capture(refined)
     assert again.warnings[-1].code == "refinement_rejected"
-    np.testing.assert_array_equal(again.light_directions, refined.light_directions)
-    with pytest.raises(UsageError, match="the light error is 0 degrees"):
+    assert_array_equal(again.light_directions, refined.light_directions)
+    with refuses("the light error is 0 degrees", UsageError):
         refine_capture(capture, error_deg=0.0)
     lamps = NearLamps.of(given, 1.0, (10, 20), equal=True)
-    with pytest.raises(UsageError, match="near lamps"):
-        refine_capture(
-            Capture(
-                "near",
-                capture.observations,
-                given,
-                capture.light_indices,
-                capture.mask,
-                lamps=lamps,
-            )
-        )
+    with refuses("near lamps", UsageError):
+        refine_capture(as_capture(observations, given, capture.mask, lamps=lamps))

@@ -2,20 +2,30 @@
 rendered scene.
 """
 
-from pathlib import Path
-
-import cv2
-import jsonschema
 import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx
 
+from cli.test_schema import check
+from distributions import seeded
 from glb_file import read_glb
-from scenes import cap_directions, codes, read_image, read_json, sphere, to_uint16, write_capture
+from scenes import (
+    cap_directions,
+    codes,
+    decode_rgb,
+    parametrize,
+    read_image,
+    read_json,
+    refuses,
+    sphere,
+    to_uint16,
+    write_capture,
+)
 from splinecli import estimate_material
 from splinecli.capture import open_capture
-from splinecli.errors import InputError, UsageError
+from splinecli.errors import UsageError
 from splinecli.estimate.inference import estimate_normals
 from splinecli.estimate.methods import make_estimator
 from splinecli.evaluation.figures import likeness
@@ -29,7 +39,7 @@ from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.integrate import integrate_normal_map
 from splinecli.pipeline.options import EvaluateOptions, IntegrateOptions
-from splinecli.recipe import prepare_capture
+from splinecli.recipe import prepare_capture, read_capture
 from splinecli.records.output_files import MAPS
 from splinecli.results.maps import make_map, map_files
 from splinecli.results.material import material_facts, material_warnings
@@ -55,7 +65,7 @@ def ggx_sphere(lights, *, diffuse, f0, roughness):
         return 2 * cosine / (cosine + np.sqrt(alpha**2 + (1 - alpha**2) * cosine**2) + 1e-12)
 
     specular = facets * masking(n_l) * masking(n_v) / np.maximum(4 * n_l * n_v, 1e-9)
-    return (n_l * (np.asarray(diffuse).reshape(-1, 1) + np.pi * f0 * specular)).astype(np.float32)
+    return np.float32(n_l * (np.asarray(diffuse).reshape(-1, 1) + np.pi * f0 * specular))
 
 
 def material(observations, lights=LIGHTS, colours=None):
@@ -69,21 +79,21 @@ def material(observations, lights=LIGHTS, colours=None):
     )
 
 
-@pytest.mark.parametrize("roughness", [0.35, 0.5])
+@parametrize("roughness", [0.35, 0.5])
 def test_a_dielectric_sphere(roughness):
     found = material(ggx_sphere(LIGHTS, diffuse=0.5, f0=0.04, roughness=roughness))
     assert abs(np.median(found.roughness) - roughness) < 0.08
     assert found.metalness.max() < 0.1
     # by definition of the exposure
-    assert np.median(found.specular) == pytest.approx(0.5, rel=0.05)
+    assert np.median(found.specular) == approx(0.5, rel=0.05)
     # With f0 = 0.04, the exposure and the base are absolute, as exact as the reflectance of the
     # facets.
-    assert found.exposure == pytest.approx(1, abs=0.25)
-    assert np.median(found.base_colour) * found.exposure == pytest.approx(0.5, rel=0.05)
+    assert found.exposure == approx(1, abs=0.25)
+    assert np.median(found.base_colour) * found.exposure == approx(0.5, rel=0.05)
     assert np.quantile(np.abs(found.base_colour / np.median(found.base_colour) - 1), 0.8) < 0.1
 
 
-@pytest.mark.parametrize("roughness", [0.35, 0.6])
+@parametrize("roughness", [0.35, 0.6])
 def test_a_metal_sphere(roughness):
     found = material(ggx_sphere(LIGHTS, diffuse=0.0, f0=0.8, roughness=roughness))
     assert abs(np.median(found.roughness) - roughness) < 0.08
@@ -114,7 +124,7 @@ def test_units_and_order_of_lights():
     observations = ggx_sphere(LIGHTS, diffuse=0.4, f0=0.05, roughness=0.4)
     plain, bright = material(observations), material(7 * observations)
     turned = material(observations[:, ::-1].copy(), LIGHTS[::-1])
-    assert bright.exposure == pytest.approx(7 * plain.exposure, rel=1e-3)
+    assert bright.exposure == approx(7 * plain.exposure, rel=1e-3)
     for name in ("base_colour", "roughness", "metalness", "specular", "confidence"):
         assert_allclose(getattr(bright, name), getattr(plain, name), atol=1e-3)
         assert_allclose(getattr(turned, name), getattr(plain, name), atol=1e-3)
@@ -127,9 +137,7 @@ def test_generated_pixels_that_training_did_not_use():
     A constant roughness is wrong by 0.24 on average, and a constant kind right for 65 %.
     """
     network, material_net = material_networks()
-    drawn = PixelGenerator(
-        PixelGeneratorConfig(capture_pixels=64), torch.Generator().manual_seed(8)
-    )
+    drawn = PixelGenerator(PixelGeneratorConfig(capture_pixels=64), seeded(8))
     rows = []
     with torch.inference_mode():
         for _ in range(6):
@@ -141,11 +149,8 @@ def test_generated_pixels_that_training_did_not_use():
             true = batch.truth.material  # type: ignore[attr-defined]
             wrong = (gloss.roughness - true.roughness[:, 0]).abs()
             is_right = (gloss.metalness > 0.5) == (true.metallic[:, 0] > 0.5)
-            rows.append(
-                torch.stack(
-                    (wrong, is_right, wrong <= 0.1, 1 - (-0.1 / gloss.roughness_error).exp()), dim=1
-                )
-            )
+            confidence = 1 - (-0.1 / gloss.roughness_error).exp()
+            rows.append(torch.stack((wrong, is_right, wrong <= 0.1, confidence), dim=1))
     table = torch.cat(rows)
     wrong, is_right, is_near, confidence = table.mean(dim=0)
     assert wrong < 0.16
@@ -156,14 +161,12 @@ def test_generated_pixels_that_training_did_not_use():
     assert table[sure, 2].mean() > 0.75
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "confidence, expected",
     [(0.35, ["gray_material", "roughness_undetermined"]), (0.8, ["gray_material"])],
 )
 def test_roughness_that_the_images_do_not_determine(confidence, expected):
-    values = np.tile(
-        np.array((0.4, 0.4, 0.4, 0.62, 0, 0.5, confidence), np.float32), (SIZE, SIZE, 1)
-    )
+    values = np.tile(np.float32((0.4, 0.4, 0.4, 0.62, 0, 0.5, confidence)), (SIZE, SIZE, 1))
     warnings = material_warnings(material_facts(values, MASK))
     assert codes(warnings) == expected
     if "roughness_undetermined" in expected:
@@ -176,7 +179,7 @@ def test_pictures_under_other_lights():
     found = material(ggx_sphere(LIGHTS, diffuse=0.3, f0=0.06, roughness=0.4))
     truth = ggx_sphere(others, diffuse=0.3, f0=0.06, roughness=0.4)
     pictures = render_gray(found, NORMALS, others, np.ones(truth.shape, bool), SURE)
-    matte = 0.3 * (NORMALS @ others.T).clip(0).astype(np.float32)
+    matte = 0.3 * np.float32((NORMALS @ others.T).clip(0))
     ours, lambertian = likeness(truth, pictures), likeness(truth, matte)
     assert ours.psnr_db > lambertian.psnr_db + 6
     assert ours.error < 0.06
@@ -184,30 +187,23 @@ def test_pictures_under_other_lights():
 
 def test_likeness_of_known_noise():
     photographs = np.linspace(0, 1, 100_000, dtype=np.float32).reshape(-1, 10)
-    found = likeness(
-        photographs, photographs + np.where(np.arange(10) % 2, 0.01, -0.01).astype(np.float32)
-    )
-    assert found.psnr_db == pytest.approx(40, abs=0.05)  # 0.01 of white
-    assert found.error == pytest.approx(0.02, rel=0.01)  # of a mean of 0.5
+    noise = np.where(np.arange(10) % 2, np.float32(0.01), np.float32(-0.01))
+    found = likeness(photographs, photographs + noise)
+    assert found.psnr_db == approx(40, abs=0.05)  # 0.01 of white
+    assert found.error == approx(0.02, rel=0.01)  # of a mean of 0.5
 
 
 def test_channels_of_the_pictures():
-    values = (
-        np.tile(np.array((1, 0.5, 0, 0.2, 0.8, 3, 0.4), np.float32), (SIZE, SIZE, 1))
-        * MASK[..., None]
-    )
+    values = np.float32((1, 0.5, 0, 0.2, 0.8, 3, 0.4)) * MASK[..., None]
     files = dict(map_files(MAPS["material"], values, MASK, ["tiff"]))
     assert set(files) == set(MAPS["material"].files)
-    pictures = {
-        name: cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-        for name, content in files.items()
-        if name.endswith(".png")
-    }
     middle = SIZE // 2, SIZE // 2
-    # occlusion, roughness, metal
-    assert pictures["metallic_roughness.png"][middle][::-1].tolist() == [255, 51, 204]
-    assert pictures["base_colour.png"][middle][::-1].tolist() == [255, 188, 0]  # sRGB of 0.5 is 188
-    assert pictures["specular.png"][middle] == 255  # 8 bits end at 1
+    for name, colour in (
+        ("metallic_roughness.png", [255, 51, 204]),  # occlusion, roughness, metal
+        ("base_colour.png", [255, 188, 0]),  # sRGB of 0.5 is 188
+        ("specular.png", [255] * 3),  # 8 bits end at 1
+    ):
+        assert decode_rgb(files[name])[middle].tolist() == colour
     assert files["specular.npy"][middle] == 3  # type: ignore[index]
     assert not files["roughness.npy"][0, 0]  # type: ignore[index]
     assert not material_facts(values, MASK).gray
@@ -236,7 +232,8 @@ def test_infer_writes_the_maps_and_a_gloss_for_the_mesh(glossy, tmp_path):
     assert report["material"]["gray"]
     assert "gray_material" in codes(report)
     base = np.load(folder / "base_colour.npy")
-    assert (base.dtype, base.shape) == (np.float32, (SIZE, SIZE, 3))
+    assert base.dtype == np.float32
+    assert base.shape == (SIZE, SIZE, 3)
     assert (base[..., 0] == base[..., 2]).all()
     stored = read_image(folder / "metallic_roughness.png")[..., ::-1]
     again = tmp_path / "again"
@@ -246,7 +243,8 @@ def test_infer_writes_the_maps_and_a_gloss_for_the_mesh(glossy, tmp_path):
         [shown] = tree["materials"]
         gloss = shown["pbrMetallicRoughness"]
         assert {"baseColorTexture", "metallicRoughnessTexture"} <= set(gloss)
-        assert (gloss.get("metallicFactor", 1), gloss.get("roughnessFactor", 1)) == (1, 1)
+        assert gloss.get("metallicFactor", 1) == 1
+        assert gloss.get("roughnessFactor", 1) == 1
         assert_array_equal(arrays["gloss"][MASK], stored[MASK])
 
 
@@ -256,18 +254,18 @@ def test_coloured_lamps_do_not_tint_gray_images(glossy):
 
 
 def test_colours_of_another_shape_are_refused(glossy):
-    estimate = estimate_normals(prepare_capture(open_capture(glossy)), make_estimator("ls"))
+    estimate = estimate_normals(read_capture(glossy), make_estimator("ls"))
     colours = np.full((len(LIGHTS), SIZE, SIZE, 3), np.float32(0.5))
     for wrong in (colours[..., 0], colours[1:], colours[:, 1:], "images"):
-        with pytest.raises(UsageError, match=r"expected numbers of shape \(12, 48, 48, 3\)"):
+        with refuses(r"expected numbers of shape \(12, 48, 48, 3\)", UsageError):
             estimate_material(estimate, wrong)
     colours[0, SIZE // 2, SIZE // 2] = np.nan
-    with pytest.raises(InputError, match="not finite"):
+    with refuses("not finite"):
         estimate_material(estimate, colours)
 
 
 def test_three_lights_are_refused(glossy):
-    with pytest.raises(InputError, match="--maps material needs at least 4 lights, found 3"):
+    with refuses("--maps material needs at least 4 lights, found 3"):
         infer_material(glossy, light_indices=(0, 1, 2), as_stored=True)
 
 
@@ -283,7 +281,7 @@ def test_a_rendered_scene(tmp_path):
     """A shape and materials of the renderer, with indirect light. A constant roughness of 0.5 is
     wrong by 0.24.
     """
-    pytest.importorskip("embreex", reason="needs the extra 'render'")
+    pytest.importorskip("embreex")
     from splinecli.workshop.synthesis.scenes import SceneConfig, draw_scene, render_scene
 
     config = SceneConfig(size=32, lights=12, samples=2, directions=8, bounces=1)
@@ -326,13 +324,13 @@ def relit(folder, n_lights):
 
 def test_evaluate_compares_with_photographs_that_were_held_out(glossy, tmp_path):
     [found] = relit(glossy, 8).document["relighting"]
-    assert (found["capture"], found["method"]) == ("ball", "ls")
-    assert (len(found["lights"]), found["held_out"]) == (8, 4)
+    assert found["capture"] == "ball"
+    assert found["method"] == "ls"
+    assert len(found["lights"]) == 8
+    assert found["held_out"] == 4
     assert found["material"]["psnr_db"] > found["lambertian"]["psnr_db"] + 1
     assert found["lambertian"]["psnr_db"] > found["nearest"]["psnr_db"]
-    written = read_json(tmp_path / "scores/results.json")
-    schema = read_json(Path(__file__).resolve().parents[2] / "docs/reports.schema.json")
-    jsonschema.Draft202012Validator({**schema, "$ref": "#/$defs/Results"}).validate(written)
+    check(read_json(tmp_path / "scores/results.json"), "Results")
 
 
 def test_relighting_needs_lights_that_are_left(glossy):
@@ -343,7 +341,7 @@ def test_relighting_needs_lights_that_are_left(glossy):
 
 def test_unequal_white_balance_changes_the_base_colour_alone(glossy):
     """The gains of a camera's channels are not known, so they tint the base colour."""
-    estimate = estimate_normals(prepare_capture(open_capture(glossy)), make_estimator("ls"))
+    estimate = estimate_normals(read_capture(glossy), make_estimator("ls"))
     images = np.zeros((len(LIGHTS), SIZE, SIZE, 3), np.float32)
     images[:, MASK] = estimate.capture.observations.T[..., None]
     gains = np.array((1.5, 1, 0.5), np.float32)

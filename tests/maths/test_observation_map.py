@@ -2,15 +2,13 @@
 there.
 """
 
-import math
-
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from distributions import seeded
+from scenes import on_sphere, parametrize, vectors
 from splinecli.maths.observation_map import (
     cell_directions,
     light_cells,
@@ -40,40 +38,20 @@ def random_rig(seed, pixels, lights):
 # CNN-PS: floor((n + 1) 31 / 2) from the lower left, which is row 31 and column 0; its last cell is
 # a single point. (0.6 + 1) * 15.5 = 24.8 and (0.3 + 1) * 15.5 = 20.15.
 CELLS = {
-    "ours": [
-        (0.01, 0.01, 15, 16),
-        (-0.01, 0.01, 15, 15),
-        (0.01, -0.01, 16, 16),
-        (-0.01, -0.01, 16, 15),
-        (0.0, 0.99, 0, 16),
-        (0.0, 1.0, 0, 16),
-        (0.0, -1.0, 31, 16),
-        (1.0, 0.0, 16, 31),
-        (-1.0, 0.0, 16, 0),
-        (1.0000001, 0.0, 16, 31),
-        (0.6, 0.3, 11, 25),
-    ],
-    "cnn-ps": [
-        (0.01, 0.01, 16, 15),
-        (-0.1, -0.1, 18, 13),
-        (0.0, 1.0, 0, 15),
-        (0.0, 0.99, 1, 15),
-        (0.0, -1.0, 31, 15),
-        (1.0, 0.0, 16, 31),
-        (0.99, 0.0, 16, 30),
-        (-1.0, 0.0, 16, 0),
-        (0.6, 0.3, 11, 24),
-    ],
+    "ours": """
+0.01 0.01 15 16; -0.01 0.01 15 15; 0.01 -0.01 16 16; -0.01 -0.01 16 15; 0 0.99 0 16; 0 1 0 16;
+0 -1 31 16; 1 0 16 31; -1 0 16 0; 1.0000001 0 16 31; 0.6 0.3 11 25""",
+    "cnn-ps": """
+0.01 0.01 16 15; -0.1 -0.1 18 13; 0 1 0 15; 0 0.99 1 15; 0 -1 31 15; 1 0 16 31; 0.99 0 16 30;
+-1 0 16 0; 0.6 0.3 11 24""",
 }
 
 
-@pytest.mark.parametrize("grid", CELLS)
+@parametrize("grid", CELLS)
 def test_cell_of_a_known_direction(grid):
     options = {} if grid == "ours" else {"grid": grid}
-    for x, y, row, column in CELLS[grid]:
-        direction = torch.tensor(
-            (x, y, math.sqrt(max(0.0, 1 - x * x - y * y))), dtype=torch.float64
-        )
+    for x, y, row, column in vectors(CELLS[grid]):
+        direction = torch.from_numpy(on_sphere(x, y))
         assert light_cells(direction, **options).item() == row * 32 + column, (x, y)
         occupied = sparse_map(torch.ones(1, 1), direction[None], **options).occupied
         assert occupied.flatten().nonzero().item() == row * 32 + column, (x, y)
@@ -90,7 +68,7 @@ def test_the_disc_of_both_grids():
     assert not (theirs & ~unit_disc(32)).any()
 
 
-@pytest.mark.parametrize("size", [8, 31, 32, 64])
+@parametrize("size", [8, 31, 32, 64])
 def test_every_cell_centre_lies_in_its_own_cell(size):
     directions, inside = cell_directions(size)
     expected = torch.arange(size * size).view(size, size)
@@ -100,9 +78,7 @@ def test_every_cell_centre_lies_in_its_own_cell(size):
 
 
 def test_lights_in_one_cell_are_averaged():
-    directions = torch.tensor(
-        [[0.01, 0.01, 1.0], [0.02, 0.03, 1.0], [0.05, 0.01, 1.0], [0.5, 0.5, 0.7]]
-    )
+    directions = torch.tensor(vectors("0.01 0.01 1; 0.02 0.03 1; 0.05 0.01 1; 0.5 0.5 0.7")).float()
     values = torch.tensor([[[1.0, 10.0], [0.0, 20.0], [0.5, 60.0], [0.3, 7.0]]])
     maps = sparse_map(values, directions)
     assert_close(maps.values[0, :, 15, 16], torch.tensor([0.5, 30.0]))
@@ -136,16 +112,14 @@ SYMMETRIES = {
 }
 
 
-@pytest.mark.parametrize("name", SYMMETRIES)
+@parametrize("name", SYMMETRIES)
 @quick
 @given(SEEDS)
 def test_maps_follow_the_lights(name, seed):
     change, changed = SYMMETRIES[name]
     observations, directions = random_rig(seed, 3, 20)
     order = torch.randperm(20, generator=seeded(seed))
-    one, other = (
-        sparse_map(observations, directions),
-        sparse_map(observations[:, order], change(directions)[order]),
-    )
+    one = sparse_map(observations, directions)
+    other = sparse_map(observations[:, order], change(directions)[order])
     assert_close(other.values, changed(one.values))
     assert torch.equal(other.occupied, changed(one.occupied))

@@ -9,12 +9,11 @@ import zlib
 
 import cv2
 import numpy as np
-import pytest
 import tifffile
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageCms
 
-from scenes import codes, with_chunk
+from scenes import codes, parametrize, put, refuses, with_chunk
 from splinecli.capture import open_capture
 from splinecli.capture.formats.facts import StatedCurve, read_header
 from splinecli.errors import UsageError
@@ -22,8 +21,8 @@ from splinecli.maths.transfer import decode_transfer, encode_srgb, parse_transfe
 from splinecli.recipe import read_capture
 
 SRGB_PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-STORED = np.linspace(0, 1, 1001).astype(np.float32)
-PIXELS = (np.indices((9, 11)).sum(axis=0)[..., None] * (500, 700, 900) + 3000).astype(np.uint16)
+STORED = np.float32(np.linspace(0, 1, 1001))
+PIXELS = np.uint16(np.indices((9, 11)).sum(axis=0)[..., None] * (500, 700, 900) + 3000)
 
 
 def curv(*numbers):
@@ -63,7 +62,7 @@ def write(path, icc, pixels=PIXELS):
     if path.suffix == ".tif":
         tifffile.imwrite(path, pixels, photometric="rgb", iccprofile=icc)
     elif path.suffix == ".jpg":
-        Image.fromarray((pixels // 257).astype(np.uint8)).save(path, icc_profile=icc)
+        Image.fromarray(np.uint8(pixels // 257)).save(path, icc_profile=icc)
     else:
         png = cv2.imencode(".png", pixels[..., ::-1])[1].tobytes()
         if icc is not None:
@@ -75,7 +74,7 @@ def write(path, icc, pixels=PIXELS):
 SRGB_PARAMETERS = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "icc, expected",
     [
         (SRGB_PROFILE, None),
@@ -95,7 +94,7 @@ def test_curves_with_a_name(icc, expected):
     assert found is not None and found[1] == expected
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "curve, expected",
     [
         (para(1, 2, 0.9, 0.1), lambda x: (0.9 * x + 0.1) ** 2),
@@ -109,7 +108,7 @@ def test_curves_without_a_name(curve, expected):
     assert_allclose(decode_transfer(STORED, found[1]), expected(STORED), atol=2e-4)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "icc",
     [
         b"",
@@ -130,7 +129,7 @@ def test_profiles_without_a_usable_curve(icc):
     assert profile_curve(icc) is None
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
+@parametrize("suffix", ".png .jpg .tif")
 def test_profiles_in_files(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     by = 'colour profile "Made up"'
@@ -143,7 +142,7 @@ def test_profiles_in_files(tmp_path, suffix):
     assert not read_header(write(path, None)).curve.unread
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
+@parametrize("suffix", ".png .jpg .tif")
 def test_a_huge_profile_counts_as_none(tmp_path, suffix):
     path = write(tmp_path / f"a{suffix}", bytes(12 << 20))  # in a PNG, 12 kB that expand
     tracemalloc.start()
@@ -161,12 +160,12 @@ def test_many_parts_in_a_jpeg(tmp_path):
 def capture(folder, icc, pixels, suffix):
     folder.mkdir()
     for number in range(4):
-        write(folder / f"{number}{suffix}", icc, (pixels * (1 - number / 10)).astype(np.uint16))
-    (folder / "lights.txt").write_text("0 0 1\n0.5 0 1\n0 0.5 1\n-0.5 0 1\n")
+        write(folder / f"{number}{suffix}", icc, np.uint16(pixels * (1 - number / 10)))
+    put(folder / "lights.txt", "0 0 1\n0.5 0 1\n0 0.5 1\n-0.5 0 1\n")
     return folder
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tif"])
+@parametrize("suffix", ".png .tif")
 def test_a_capture_is_read_with_the_curve_of_its_profile(tmp_path, suffix):
     adobe = capture(tmp_path / "adobe", profile(curv(563), name="Adobe RGB (1998)"), PIXELS, suffix)
     found = read_capture(adobe)
@@ -175,7 +174,7 @@ def test_a_capture_is_read_with_the_curve_of_its_profile(tmp_path, suffix):
     )
     assert "display_decoded" not in codes(linear)
     plain = read_capture(capture(tmp_path / "plain", None, PIXELS, suffix), as_stored=True)
-    np.testing.assert_array_equal(linear.observations, plain.observations)
+    assert_array_equal(linear.observations, plain.observations)
     expected = np.mean((PIXELS.reshape(-1, 3) / 65535) ** 2.1992, axis=1)
     assert_allclose(found.observations[:, 0], expected, rtol=1e-5)
     (told,) = [str(warning) for warning in found.warnings if warning.code == "display_decoded"]
@@ -220,10 +219,7 @@ def test_srgb():
 
 def test_decoding_turns_encoding_back():
     codes = np.arange(256)
-    assert (
-        encode_srgb(decode_transfer((codes / 255).astype(np.float32), None)).tolist()
-        == codes.tolist()
-    )
+    assert encode_srgb(decode_transfer(np.float32(codes / 255), None)).tolist() == codes.tolist()
     assert_allclose(decode_transfer(np.float32([0.25, 0.5]), 2.0), [0.0625, 0.25])
 
 
@@ -235,7 +231,5 @@ def test_names_of_curves():
         2.2,
     ]
     for text in ("", "sRGB", "gamma", "gamma:", "gamma:0", "gamma:1.2.3", "gamma:99"):
-        with pytest.raises(
-            UsageError, match=r"expected auto, linear, srgb, or gamma:G with G from 0\.1 to 10"
-        ):
+        with refuses(r"expected auto, linear, srgb, or gamma:G with G from 0\.1 to 10", UsageError):
             parse_transfer(text)

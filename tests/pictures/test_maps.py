@@ -5,13 +5,14 @@ PNG files keep every value; curves leave out what was not computed, and anything
 """
 
 from functools import cache
+from itertools import product
 
 import cv2
 import numpy as np
-import pytest
 from numpy.testing import assert_array_equal
+from pytest import approx
 
-from scenes import decode_rgb
+from scenes import decode_rgb, parametrize, refuses
 from splinecli.errors import OutputError
 from splinecli.maths.normals import unit
 from splinecli.pictures.maps import (
@@ -53,19 +54,13 @@ def test_the_preview_is_brightest_where_the_surface_faces_the_light():
 
 
 def test_png_keeps_every_value(monkeypatch):
-    for dtype, shape in (
-        (np.uint8, (7, 5)),
-        (np.uint16, (7, 5)),
-        (np.uint8, (7, 5, 3)),
-        (np.uint16, (7, 5, 3)),
-    ):
-        picture = np.random.default_rng(0).integers(
-            0, np.iinfo(dtype).max, shape, dtype, endpoint=True
-        )
+    for dtype, shape in product((np.uint8, np.uint16), ((7, 5), (7, 5, 3))):
+        most = np.iinfo(dtype).max
+        picture = np.random.default_rng(0).integers(0, most, shape, dtype, endpoint=True)
         stored = cv2.imdecode(np.frombuffer(encode_png(picture), np.uint8), cv2.IMREAD_UNCHANGED)
         assert_array_equal(stored if picture.ndim == 2 else stored[..., ::-1], picture)
     monkeypatch.setattr(cv2, "imencode", lambda *_: (False, np.empty(0, np.uint8)))
-    with pytest.raises(OutputError, match="cannot be encoded as PNG"):
+    with refuses("cannot be encoded as PNG", OutputError):
         encode_png(np.zeros((2, 2), np.uint8))
 
 
@@ -75,14 +70,13 @@ WHITE = (255, 255, 255)
 
 
 def test_known_errors_have_known_colours():
-    errors = np.array([[0, 15, 30, 180, np.nan]], np.float32)
-    colours = colour_errors(errors).astype(int)
+    colours = colour_errors(np.array([[0, 15, 30, 180, np.nan]], np.float32)).astype(int)
     wanted = np.array([[VIOLET, TEAL, YELLOW, YELLOW, WHITE]])
     assert np.abs(colours - wanted).max() <= 2  # OpenCV's table is rounded in its own way
     assert (colours[0, 4] == 255).all()
 
 
-def test_a_small_map_is_enlarged_pixel_by_pixel_and_a_large_one_keeps_its_pixels():
+def test_a_small_map_is_enlarged_pixel_by_pixel_and_a_large_one_keeps_its_pixels(rng):
     errors = np.full((60, 50), np.nan, np.float32)
     errors[10:20, 30:40] = 30
     picture = error_map_picture(errors)
@@ -90,13 +84,13 @@ def test_a_small_map_is_enlarged_pixel_by_pixel_and_a_large_one_keeps_its_pixels
     square = np.zeros((300, 250), bool)
     square[50:100, 150:200] = True
     assert_array_equal((picture[:, :250] != 255).any(axis=2), square)
-    errors = np.random.default_rng(0).uniform(0, 60, (400, 300)).astype(np.float32)
+    errors = rng.uniform(0, 60, (400, 300)).astype(np.float32)
     picture = error_map_picture(errors)
     assert picture.shape[0] == 400
     assert_array_equal(picture[:, :300], colour_errors(errors))
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (10, 2000), (2000, 10), (256, 256)])
+@parametrize("shape", [(1, 1), (10, 2000), (2000, 10), (256, 256)])
 def test_the_bar_runs_from_0_to_the_top(shape):
     picture = error_map_picture(np.full(shape, np.nan, np.float32))
     assert picture.shape[0] == max(shape[0], 256)
@@ -107,8 +101,7 @@ def test_the_bar_runs_from_0_to_the_top(shape):
     assert bar.shape[1] >= 18
     assert_array_equal(bar[:, 0], colour_errors(np.linspace(TOP_DEG, 0, len(bar))[:, None])[:, 0])
     # Text: black ink right of the bar, and none cut at the picture's edges.
-    right = picture[:, columns[-1] + 1 :]
-    assert (right < 64).all(axis=2).sum() > 200
+    assert (picture[:, columns[-1] + 1 :] < 64).all(axis=2).sum() > 200
     assert (picture[[0, -1]] == 255).all()
     assert (picture[:, -1] == 255).all()
 
@@ -164,7 +157,7 @@ def test_scales_and_hidden_axes():
 LIGHTS = np.array([(0, 0, 1), (0.6, 0, 0.8)])
 
 
-@pytest.mark.parametrize("name", ["b\udcff", "a\nb\x1b[2J", r"$\frac$"])
+@parametrize("name", ["b\udcff", "a\nb\x1b[2J", r"$\frac$"])
 def test_a_name_that_is_not_printable_or_a_formula(name):
     assert sky_plot(LIGHTS, name) != sky_plot(LIGHTS, "")
 
@@ -185,11 +178,10 @@ def draw(height, width, methods, error_deg=12.0, title="title"):
 
 
 def places_of(colour, picture):
-    """Boxes (top, left, height, width) of the large connected areas of a colour, from the left."""
-    _, _, boxes, _ = cv2.connectedComponentsWithStats(
-        (picture == colour).all(axis=2).astype(np.uint8)
-    )
-    return sorted((int(y), int(x), int(h), int(w)) for x, y, w, h, area in boxes[1:] if area > 500)
+    """Boxes (top, left, height, width) of the large connected areas of a colour, from the top."""
+    same = np.uint8(np.abs(picture.astype(int) - colour).max(axis=2) <= 2)
+    _, _, found, _ = cv2.connectedComponentsWithStats(same)
+    return sorted((int(y), int(x), int(h), int(w)) for x, y, w, h, area in found[1:] if area > 400)
 
 
 BLUE = (128, 128, 255)  # of (0, 0, 1)
@@ -200,8 +192,8 @@ def error_colour(error_deg):
     return tuple(int(value) for value in colour_errors(np.array([[error_deg]]))[0, 0])
 
 
-@pytest.mark.parametrize("n_methods", [1, 2, 9])
-@pytest.mark.parametrize("height, width", [(10, 10), (300, 200), (40, 120), (120, 40)])
+@parametrize("n_methods", [1, 2, 9])
+@parametrize("height, width", [(10, 10), (300, 200), (40, 120), (120, 40)])
 def test_colours_stand_where_they_belong(height, width, n_methods):
     picture = draw(height, width, [f"method {i}" for i in range(n_methods)])
     [truth] = places_of(BLUE, picture)
@@ -270,24 +262,17 @@ def draw_cells(n_pixels, *, with_truth=True, with_dense=True, named=True):
     return decode_rgb(png)
 
 
-def boxes(picture, colour):
-    """Left, top, width, height of the areas of a colour that are as large as a cell, downwards."""
-    same = (np.abs(picture.astype(int) - colour).max(axis=2) <= 2).astype(np.uint8)
-    _, _, stats, _ = cv2.connectedComponentsWithStats(same)
-    return sorted((box[:4] for box in stats[1:] if box[4] > 400), key=lambda box: (box[1], box[0]))
-
-
-@pytest.mark.parametrize("n_pixels", [1, 4])
+@parametrize("n_pixels", [1, 4])
 def test_cells_stand_where_they_are(n_pixels):
     picture = draw_cells(n_pixels)
     # Frames around a map, from its empty corner beside the circle.
-    dense = [box for box in boxes(picture, CELL_VIOLET) if min(box[2:]) > 100]
+    dense = [box for box in places_of(CELL_VIOLET, picture) if min(box[2:]) > 100]
     assert len(dense) == n_pixels
-    for cell, whole in zip(boxes(picture, CELL_YELLOW), dense, strict=True):
+    for cell, whole in zip(places_of(CELL_YELLOW, picture), dense, strict=True):
         side = whole[2] / SIZE
-        assert cell[2:] == pytest.approx([side, side], abs=2)
-        assert cell[1] - whole[1] == pytest.approx(side, abs=3)  # row 1
-        assert cell[0] < whole[0]  # the sparse map is left of the dense one
+        assert cell[2:] == approx([side, side], abs=2)
+        assert cell[0] - whole[0] == approx(side, abs=3)  # row 1
+        assert cell[1] < whole[1]  # the sparse map is left of the dense one
 
 
 def test_empty_cells_are_gray_and_the_truth_may_be_missing():
@@ -298,12 +283,11 @@ def test_empty_cells_are_gray_and_the_truth_may_be_missing():
 
 
 def test_a_training_run_leaves_out_the_title_and_the_places_and_perhaps_the_dense_map():
-    whole, unnamed, without = (
-        draw_cells(2),
-        draw_cells(2, named=False),
-        draw_cells(2, named=False, with_dense=False),
-    )
-    assert len(boxes(unnamed, CELL_YELLOW)) == len(boxes(without, CELL_YELLOW)) == 2
-    assert boxes(unnamed, CELL_YELLOW)[0][1] < boxes(whole, CELL_YELLOW)[0][1]  # no title above
+    whole, unnamed = draw_cells(2), draw_cells(2, named=False)
+    without = draw_cells(2, named=False, with_dense=False)
+    assert len(places_of(CELL_YELLOW, unnamed)) == len(places_of(CELL_YELLOW, without)) == 2
+    assert (
+        places_of(CELL_YELLOW, unnamed)[0][0] < places_of(CELL_YELLOW, whole)[0][0]
+    )  # no title above
     assert without.shape[1] < unnamed.shape[1]
-    assert not [box for box in boxes(without, CELL_VIOLET) if box[2] > 100]
+    assert not [box for box in places_of(CELL_VIOLET, without) if box[3] > 100]

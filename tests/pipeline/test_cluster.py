@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import worker_tasks
-from scenes import read_json, write_capture
+from scenes import names_in, put, read_json, refuses, vectors, write_capture
 from splinecli.cli.main import main
 from splinecli.errors import InputError, ModelError, OutputError, SplinecliError, UsageError
 from splinecli.maths.normals import unit
@@ -31,7 +31,7 @@ from splinecli.pipeline.distribution import Distributor, LostError, Work, WorkIt
 from splinecli.pipeline.infer_options import ClusterOptions, InferOptions
 from splinecli.system.progress import SILENT
 
-distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+distributed = pytest.importorskip("distributed")
 GB = 10**9
 
 
@@ -138,7 +138,7 @@ def test_workers_that_do_not_fit(client, work, tmp_path):
 
 
 def test_gpu_workers_only(client, work):
-    with pytest.raises(UsageError, match="no worker has the Dask resource GPU"):
+    with refuses("no worker has the Dask resource GPU", UsageError):
         run(client, work(worker_tasks.double), numbered(range(3)), gpu=True)
     client.run(worker_tasks.set_resources, GPU=1)
     try:
@@ -153,9 +153,7 @@ def test_gpu_workers_only(client, work):
 
 def write_captures(names):
     """Write small captures of different content into the working folder; `broken` has no images."""
-    lights = unit(
-        np.array([(0, 0, 1), (0.5, 0, 1), (-0.5, 0, 1), (0, 0.5, 1), (0.1, -0.5, 1)], float)
-    )
+    lights = unit(vectors("0 0 1; 0.5 0 1; -0.5 0 1; 0 0.5 1; 0.1 -0.5 1"))
     for seed, name in enumerate(names):
         images = np.random.default_rng(seed).integers(20_000, 50_000, (5, 12, 15), np.uint16)
         write_capture(Path(name), images[: 0 if name == "broken" else 5], lights)
@@ -191,9 +189,9 @@ def test_a_cluster_gives_what_one_process_gives(cluster, tmp_path, monkeypatch, 
         for place in ("out", "alone")
     ]
     assert rows[0] == rows[1] and len(rows[0]) == len(names)
-    assert sorted(path.name for path in Path("out").iterdir()) == ["a", "b", "c", "d", "index.html"]
+    assert names_in("out") == {"a", "b", "c", "d", "index.html"}
     # What is done is skipped: the reports have the seconds of the first run.
-    Path("scheduler.json").write_text(json.dumps({"address": cluster.scheduler_address}))
+    put("scheduler.json", json.dumps({"address": cluster.scheduler_address}))
     assert documents("-o", "out", "--cluster", "scheduler.json") == together
 
 
@@ -215,7 +213,7 @@ def test_shards_side_by_side_share_a_folder(cluster, tmp_path, capfd):
     with distributor(partial(worker_tasks.double, "out"), Path("out"), options, SILENT) as workers:
         assert main([*call, "--shard", "1/2"]) == 0
         assert [result for _, result in workers.run(numbered(range(2)))] in ([0, 2], [2, 0])
-    assert sorted(path.name for path in Path("out").iterdir()) == ["a", "c", "index.html"]
+    assert names_in("out") == {"a", "c", "index.html"}
     assert "unfinished" not in capfd.readouterr().err
 
 
@@ -224,13 +222,13 @@ def test_other_weights_on_a_worker(cluster, tmp_path, monkeypatch):
     weights = SimpleNamespace(weights={"sha256": "1234"})
     monkeypatch.setattr(batch, "make_method", lambda options: weights)
     options = ClusterOptions(address=cluster.scheduler_address)
-    with pytest.raises(ModelError, match="expected 1234 as on the machine of the command"):
+    with refuses("expected 1234 as on the machine of the command", ModelError):
         list(infer_batch(folders, InferOptions(method="cnn-ps"), cluster=options))
     assert not Path("out").exists()
 
 
 def test_no_scheduler(monkeypatch):
-    Path("broken.json").write_text("{}")
+    put("broken.json", "{}")
     monkeypatch.setattr(distribution_module, "CONNECT_SECONDS", 0.2)
     monkeypatch.setattr(distribution_module, "ANSWER_SECONDS", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as server:  # no scheduler
@@ -243,9 +241,7 @@ def test_no_scheduler(monkeypatch):
             "tcp://",
         ]
         for address in (*addresses, f"tcp://127.0.0.1:{server.getsockname()[1]}"):
-            with pytest.raises(
-                UsageError, match=r"no Dask scheduler answers at|expected an address such as"
-            ):
+            with refuses(r"no Dask scheduler answers at|expected an address such as", UsageError):
                 distribution_module.connected(ClusterOptions(address=address)).__enter__()
 
 
@@ -291,7 +287,9 @@ def test_errors_travel(client):
         SplinecliError("x"),
     ):
         found = client.submit(lambda error: error, error, pure=False).result()
-        assert (type(found), str(found), vars(found)) == (type(error), str(error), vars(error))
+        assert type(found) is type(error)
+        assert str(found) == str(error)
+        assert vars(found) == vars(error)
 
 
 def test_the_number_of_workers(tmp_path, monkeypatch):

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
-import pytest
 
-from scenes import Teacher, cap_directions, spiral_lights
+from scenes import Teacher, cap_directions, parametrize, refuses, spiral_lights
 from splinecli.capture import Capture
 from splinecli.errors import UsageError
 from splinecli.estimate.methods.estimator import LeastSquares, StudentSize
@@ -67,7 +66,7 @@ def test_wanted(monkeypatch):
     assert teacher.asked == found.distillation.sample == 750
 
 
-@pytest.mark.parametrize("seconds", [0.0, 0.02])
+@parametrize("seconds", [0.0, 0.02])
 def test_the_size_decides_about_large_captures_not_the_speed(monkeypatch, seconds):
     """The load of a machine must not change normals."""
     monkeypatch.setattr(infer, "student_sizes", lambda _: (StudentSize(100, 20, 16),) * 2)
@@ -94,7 +93,7 @@ def test_refused():
         ),
         (capture(200), Slow(), "matte: 200 pixels are too few to distil"),
     ):
-        with pytest.raises(UsageError, match=problem):
+        with refuses(problem, UsageError):
             distil_for(few, estimator, True)
         assert distil_for(few, estimator, None) == (None, [])
 
@@ -103,7 +102,7 @@ def test_a_large_capture_with_few_lit_pixels_is_left_to_the_network():
     """Without a mask, most pixels are a black background."""
     dark = capture(AUTOMATIC_FROM)
     dark.observations[100:] = 0
-    with pytest.raises(UsageError, match="matte: 100 pixels are lit, too few to distil"):
+    with refuses("matte: 100 pixels are lit, too few to distil", UsageError):
         distil_for(dark, Slow(), True)
     assert distil_for(dark, Slow(), None) == (None, [])
 

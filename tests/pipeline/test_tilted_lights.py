@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenes import cap_directions, sphere
-from splinecli.capture import Capture
+from scenes import as_capture, cap_directions, parametrize, pinhole, sphere
 from splinecli.estimate.inference import NormalEstimate
 from splinecli.maths.normals import angle_between_deg
 from splinecli.pipeline.infer import undo_tilt
@@ -19,8 +18,7 @@ TILT = Rotation.from_rotvec(np.radians((0, 18, 0)))
 
 
 def capture(lights, **fields):
-    observed = (NORMALS[INSIDE] @ LIGHTS.T).clip(0).astype(np.float32)
-    return Capture("ball", observed, lights, tuple(range(10)), INSIDE, **fields)
+    return as_capture((NORMALS[INSIDE] @ LIGHTS.T).clip(0), lights, INSIDE, **fields)
 
 
 def network(confidence, follows=1.0):
@@ -35,13 +33,13 @@ def network(confidence, follows=1.0):
             INSIDE[..., None], part.apply(NORMALS.reshape(-1, 3)).reshape(64, 64, 3), 0
         )
         off_deg = float(np.degrees(turn.magnitude()))
-        sure = np.where(INSIDE, confidence(off_deg), 0).astype(np.float32)
-        return NormalEstimate(of, normals.astype(np.float32), 0.0, confidence_map=sure)
+        sure = np.float32(np.where(INSIDE, confidence(off_deg), 0))
+        return NormalEstimate(of, np.float32(normals), 0.0, confidence_map=sure)
 
     return estimate
 
 
-@pytest.mark.parametrize("follows", [1.0, 0.7])
+@parametrize("follows", [1.0, 0.7])
 def test_lights_are_tilted_back_in_steps(follows):
     again, given = network(lambda off_deg: 0.9, follows), capture(TILT.apply(LIGHTS))
     given = replace(given, mended=(CURVE_MENDED.code,))
@@ -70,9 +68,7 @@ def test_right_lights_and_lights_from_the_images_stay():
     for kept in (
         capture(LIGHTS, warnings=(warning,)),
         capture(TILT.apply(LIGHTS), light_errors_deg=np.ones(10)),
-        capture(
-            TILT.apply(LIGHTS), camera_matrix=np.array(((90.0, 0, 32), (0, 90, 32), (0, 0, 1)))
-        ),
+        capture(TILT.apply(LIGHTS), camera_matrix=pinhole(90, 32, 32)),
     ):
         before = again(kept)
         assert undo_tilt(before, again, mends=True) == (before, [])

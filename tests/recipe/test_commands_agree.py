@@ -12,6 +12,8 @@ from scenes import (
     BUMP_LAMPS,
     codes,
     evaluate,
+    parametrize,
+    put,
     read_image,
     shade,
     sphere,
@@ -19,6 +21,7 @@ from scenes import (
     to_uint16,
     write_bump,
     write_capture,
+    write_image,
 )
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.evaluation.protocol import Protocol
@@ -54,7 +57,7 @@ def photograph(albedo, lamps=None, gloss=0.0):
 
 
 def write(folder, images, **more):
-    given = {"mask": MASK, "normals": NORMALS.astype(np.float32), **more}
+    given = {"mask": MASK, "normals": np.float32(NORMALS), **more}
     return write_capture(folder, images, LIGHTS, **given)
 
 
@@ -67,11 +70,11 @@ def moved(images):
 
 
 def clipped(images):
-    return np.where(images > 30_000, 65_535, images * 2).astype(np.uint16)
+    return np.uint16(np.where(images > 30_000, 65_535, images * 2))
 
 
 def eight_bits(images):
-    return np.rint(images / 257).astype(np.uint8)
+    return np.uint8(np.rint(images / 257))
 
 
 def blurred(images):
@@ -81,7 +84,7 @@ def blurred(images):
 def near_lamps(folder):
     write_bump(folder)
     rows = "\n".join(" ".join(map(str, lamp)) for lamp in BUMP_LAMPS)
-    (folder / "light_positions.txt").write_text(f"{rows}\n")
+    put(folder / "light_positions.txt", f"{rows}\n")
     return folder
 
 
@@ -95,7 +98,7 @@ STILL = {
     ),
     "RGB intensities": lambda folder: write(folder, photograph(SOFT, LAMPS), intensities=LAMPS),
     "saturated": lambda folder: write(folder, clipped(photograph(GRAY))),
-    "dark": lambda folder: write(folder, (photograph(GRAY) // 40).astype(np.uint16)),
+    "dark": lambda folder: write(folder, np.uint16(photograph(GRAY) // 40)),
     "8 bits": lambda folder: write(folder, eight_bits(photograph(GRAY))),
     "blurred": lambda folder: write(folder, blurred(photograph(GRAY))),
     "gray images": lambda folder: write(folder, photograph(GRAY)[..., 0]),
@@ -117,7 +120,7 @@ OTHERS = {
 }
 
 
-@pytest.mark.parametrize("name", [*STILL, *OTHERS])
+@parametrize("name", [*STILL, *OTHERS])
 def test_all_commands_agree(tmp_path, name):
     """The warnings of info, the error of evaluate and the normals of Python are those of infer."""
     folder = (STILL | OTHERS)[name](tmp_path / "capture")
@@ -160,18 +163,17 @@ def with_and_without_align(tmp_path, name, **options):
     folder = STILL[name](tmp_path / "capture")
     for align in (False, True):
         made = InferOptions(method="ls", output=str(tmp_path), align=align, **options)
-        told = infer_capture(folder, made)["warnings"]
-        yield told, np.load(tmp_path / "capture/normals.npy")
+        yield infer_capture(folder, made)["warnings"], np.load(tmp_path / "capture/normals.npy")
 
 
-@pytest.mark.parametrize("name", ["plain", "coloured lamps", "strongly coloured object", "blurred"])
+@parametrize("name", ["plain", "coloured lamps", "strongly coloured object", "blurred"])
 def test_aligning_a_still_capture_changes_nothing(tmp_path, name):
     (told, normals), (again, aligned) = with_and_without_align(tmp_path, name)
     assert told == again
     assert_array_equal(normals, aligned)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "name, options",
     [
         ("strongly coloured object", {"strict": True}),
@@ -187,7 +189,7 @@ def test_coloured_lamps_leave_nothing_but_their_warning(tmp_path, name, options)
             assert angle_between_deg(normals[inside], NORMALS[inside]).mean() < 0.1
 
 
-@pytest.mark.parametrize("given", [{"as_stored": True}, {"intensities": "equal"}], ids=str)
+@parametrize("given", [{"as_stored": True}, {"intensities": "equal"}], ids=str)
 def test_colours_that_stay_are_no_motion(tmp_path, given):
     (_, normals), (_, aligned) = with_and_without_align(
         tmp_path, "strongly coloured object", **given
@@ -198,6 +200,6 @@ def test_colours_that_stay_are_no_motion(tmp_path, given):
 def test_images_that_are_not_used_may_have_another_size(tmp_path):
     folder = STILL["plain"](tmp_path / "capture")
     last = folder / "011.png"
-    cv2.imwrite(str(last), read_image(last)[:-4])
+    write_image(last, read_image(last)[:-4])
     options = {"method": "ls", "output": str(tmp_path), "light_indices": tuple(range(11))}
     assert infer_capture(folder, InferOptions(align=True, **options))["n_lights"] == 11

@@ -2,11 +2,18 @@
 albedo.
 """
 
-import cv2
 import numpy as np
 import pytest
 
-from scenes import read_image, square_grid, to_uint16, write_capture, write_image
+from scenes import (
+    on_sphere,
+    read_image,
+    square_grid,
+    to_uint16,
+    vectors,
+    write_capture,
+    write_image,
+)
 from splinecli.capture import open_capture
 from splinecli.lights.calibration.balls import find_ball_files
 from splinecli.lights.calibration.lamps import measure_light_intensities
@@ -15,14 +22,8 @@ from splinecli.recipe import RecipeOptions, prepare_capture
 from splinecli.results.map_values import albedo_map
 
 SIZE = 40
-INTENSITIES = np.array(
-    [(1.0, 0.9, 0.8), (0.7, 0.7, 0.7), (0.5, 0.6, 0.7), (1, 1, 1), (0.8, 1, 0.8), (1, 1, 0.5)]
-)
-LIGHTS = unit(
-    np.array(
-        [(0, 0, 1), (0.5, 0, 0.8), (-0.5, 0, 0.8), (0, 0.5, 0.8), (0, -0.5, 0.8), (0.3, 0.3, 0.9)]
-    )
-)
+INTENSITIES = vectors("1 0.9 0.8; 0.7 0.7 0.7; 0.5 0.6 0.7; 1 1 1; 0.8 1 0.8; 1 1 0.5")
+LIGHTS = unit(vectors("0 0 1; 0.5 0 0.8; -0.5 0 0.8; 0 0.5 0.8; 0 -0.5 0.8; 0.3 0.3 0.9"))
 
 
 @pytest.fixture
@@ -32,8 +33,7 @@ def scene(tmp_path):
     """
     x, y = square_grid(SIZE, 1 - 1 / SIZE)
     inside = np.hypot(x, y) < 0.9
-    z = np.sqrt(np.where(inside, 1 - x**2 - y**2, 1))
-    normals = np.where(inside[..., None], np.stack((x, y, z), axis=-1), 0).astype(np.float32)
+    normals = np.float32(on_sphere(x, y) * inside[..., None])
     rng = np.random.default_rng(0)
     albedo = np.where(inside[..., None], rng.uniform(0.1, 0.6, (SIZE, SIZE, 3)), 0)
     images = albedo * (normals @ LIGHTS.T).clip(0).transpose(2, 0, 1)[..., None]
@@ -54,7 +54,7 @@ def test_a_gray_target_balances_the_colours(scene, tmp_path):
     tint = INTENSITIES * (1, 0.7, 0.4)
     for number, (light, colour) in enumerate(zip(LIGHTS, tint, strict=True)):
         card = np.broadcast_to(0.5 * light[2] * colour * 65535, (20, 20, 3))
-        cv2.imwrite(str(tmp_path / f"card/{number}.png"), to_uint16(card[..., ::-1]))
+        write_image(tmp_path / f"card/{number}.png", to_uint16(card[..., ::-1]))
         gray = 0.4 * (normals @ light).clip(0)[..., None] * colour * 65535
         write_image(folder / f"{number}.png", to_uint16(gray[..., ::-1]))
     measured = measure_light_intensities(find_ball_files(tmp_path / "card"), LIGHTS, "card")
@@ -72,8 +72,8 @@ def test_restored_pixels_do_not_spoil_it(scene):
     """
     folder, normals, albedo = scene
     for path in folder.glob("[0-9].png"):
-        picture = read_image(path).astype(np.int64)
-        write_image(path, np.minimum(2.5 * picture, 65_535).astype(np.uint16))
+        picture = np.int64(read_image(path))
+        write_image(path, np.uint16(np.minimum(2.5 * picture, 65_535)))
     source = open_capture(folder)
     capture = prepare_capture(source)
     stored = prepare_capture(source, options=RecipeOptions(as_stored=True)).observations
@@ -92,7 +92,8 @@ def test_albedo_in_colour(scene):
     steps = []
     found = albedo_map(source, prepare_capture(source), normals, progress=lambda: steps.append(1))
     assert len(steps) == 6
-    assert (found.dtype, found.shape) == (np.float32, (SIZE, SIZE, 3))
+    assert found.dtype == np.float32
+    assert found.shape == (SIZE, SIZE, 3)
     inside = normals.any(axis=2)
     assert not found[~inside].any()
     error = np.abs(found - albedo)[inside] / albedo[inside]
@@ -106,5 +107,5 @@ def test_albedo_in_colour(scene):
     )
     assert np.quantile(np.abs(plain / albedo[inside].mean(axis=1) - 1), 0.9) > 0.2
     # Where no light reaches the surface, it is black.
-    turned = albedo_map(source, prepare_capture(source), (normals * (1, 1, -1)).astype(np.float32))
+    turned = albedo_map(source, prepare_capture(source), np.float32(normals * (1, 1, -1)))
     assert not turned[normals[..., 2] > 0.95].any()

@@ -12,12 +12,11 @@ from unittest import mock
 
 import cv2
 import numpy as np
-import pytest
 import tifffile
 import torch
 
 from html_page import REPORT, SIDE, HtmlPage, ball, light_at
-from scenes import decode_rgb, square_grid, write_image
+from scenes import decode_rgb, parametrize, square_grid, write_image
 from splinecli.evaluation.document import html_report
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 from splinecli.materials.lobes import GGX, Geometry, diffuse_lobe, facet_lobe
@@ -80,11 +79,11 @@ def test_it_stands_alone():
 
 def test_figures_and_pictures():
     normals, mask = ball(40)
-    errors = np.where(mask, 90 * normals[..., 2], np.nan).astype(np.float32)
+    errors = np.float32(np.where(mask, 90 * normals[..., 2], np.nan))
     report = {**REPORT, "warnings": [{"code": "eight_bit", "text": "The images are 8-bit."}]}
     maps = {
         "albedo": np.full_like(normals, 0.3) * mask[..., None],
-        "confidence": mask.astype(np.float32) * 0.6,
+        "confidence": np.float32(mask) * 0.6,
     }
     page = Page(result_page(report, normals, mask, values=maps, error_map_deg=errors))
     assert page.text["h1"] == page.text["title"] == ["Photometric stereo: ball"]
@@ -126,11 +125,10 @@ def test_names_are_text():
     assert page.facts["Method"] == page.facts["Weights"] == page.text["li"][0] == HOSTILE
 
 
-def test_the_normals_survive():
-    random = np.random.default_rng(0)
+def test_the_normals_survive(rng):
     # all round, those seen from behind, too
-    normals = unit(random.normal(size=(70, 90, 3))).astype(np.float32)
-    mask = random.random((70, 90)) < 0.8
+    normals = np.float32(unit(rng.normal(size=(70, 90, 3))))
+    mask = rng.random((70, 90)) < 0.8
     decoded = Page(result_page(REPORT, normals * mask[..., None], mask)).normals()
     assert (decoded.any(axis=2) == mask).all()
     assert angle_between_deg(decoded, normals)[mask].max() < 0.02
@@ -206,11 +204,11 @@ def views(open_page, html, fragments, *, webgl=True):
         if fragment != fragments[0]:
             page.evaluate(CHANGE, fragment)
         png = page.screenshot(clip={"x": edge, "y": edge, "width": SIDE, "height": SIDE})
-        seen.append(decode_rgb(png).astype(np.int64))
+        seen.append(np.int64(decode_rgb(png)))
     return seen
 
 
-@pytest.mark.parametrize("webgl", [True, False])
+@parametrize("webgl", [True, False])
 def test_a_matte_sphere_is_lit_by_the_cosine(open_page, webgl):
     normals, mask = ball()
     html = result_page(REPORT, normals, mask)
@@ -240,7 +238,7 @@ def test_a_glossy_sphere_of_two_colours(open_page):
         / 8
         * np.maximum(normals @ unit(light + np.array((0, 0, 1))), 0)[..., None] ** shininess
     )
-    stored = decode_transfer(albedo_picture(albedo, mask).astype(np.float32) / 255, None)
+    stored = decode_transfer(np.float32(albedo_picture(albedo, mask)) / 255, None)
 
     html = result_page(REPORT, normals, mask, values={"albedo": albedo})
     fragment = f"light=-0.5,0.4&specular={gain}&shininess={shininess}"
@@ -255,7 +253,7 @@ def glossy(n, light, exponent):
     return np.maximum(n @ unit(light + np.array((0, 0, 1))), 0) ** exponent
 
 
-@pytest.mark.parametrize("webgl", [True, False])
+@parametrize("webgl", [True, False])
 def test_views_ambient_light_and_confidence(open_page, webgl):
     normals, mask = ball()
     light, ambient = light_at(0.8, -0.1), 0.4
@@ -284,7 +282,7 @@ def test_views_ambient_light_and_confidence(open_page, webgl):
     assert np.abs(pictures[-1] - red)[doubtful].max() <= 3
 
 
-@pytest.mark.parametrize("webgl", [True, False])
+@parametrize("webgl", [True, False])
 def test_zoom_shows_a_part_of_the_same_picture(open_page, webgl):
     """Zoom 2 around (80, 100) shows the map's pixels 16 to 144 and 36 to 164; the sphere is known
     at any place.
@@ -300,7 +298,7 @@ def test_zoom_shows_a_part_of_the_same_picture(open_page, webgl):
     assert np.abs(seen - expected[..., None])[smooth].max() <= (3 if webgl else 6)
 
 
-@pytest.mark.parametrize("webgl", [True, False])
+@parametrize("webgl", [True, False])
 def test_a_soft_and_coloured_light(open_page, webgl):
     """Softness 1 is the light of the half of the sky around the light's direction."""
     normals, mask = ball()
@@ -311,7 +309,7 @@ def test_a_soft_and_coloured_light(open_page, webgl):
         (0.3, 1), views(open_page, html, fragments, webgl=webgl), strict=True
     ):
         lit = np.maximum((normals @ light + softness) / (1 + softness), 0)[..., None]
-        tint = decode_transfer(colour.astype(np.float32) / 255, None)
+        tint = decode_transfer(np.float32(colour) / 255, None)
         assert np.abs(seen - encode_srgb(lit * tint) * mask[..., None]).max() <= 3
 
 
@@ -335,15 +333,13 @@ def material_of_ball(mask):
     """
     down, right = np.mgrid[:SIDE, :SIDE] / SIDE
     roughness = np.rint(255 * (0.25 + 0.5 * down)) / 255
-    reflectance = decode_transfer(
-        encode_srgb(np.full((SIDE, SIDE), 0.04)).astype(np.float32) / 255, None
-    )
+    reflectance = decode_transfer(np.float32(encode_srgb(np.full((SIDE, SIDE), 0.04))) / 255, None)
     base = decode_transfer(np.full((SIDE, SIDE, 3), np.float32([200, 90, 60])) / 255, None)
     columns = roughness, (right > 0.5).astype(float), reflectance / 0.08, mask.astype(float)
-    return (np.dstack((base, *columns)) * mask[..., None]).astype(np.float32)
+    return np.float32(np.dstack((base, *columns)) * mask[..., None])
 
 
-@pytest.mark.parametrize("webgl", [True, False])
+@parametrize("webgl", [True, False])
 def test_a_material_reflects_as_in_the_estimate(open_page, webgl):
     normals, mask = ball()
     material = material_of_ball(mask)
@@ -357,7 +353,7 @@ def test_a_material_reflects_as_in_the_estimate(open_page, webgl):
         open_page, html, [f"light={x},{y}&exposure=-1" for x, y in lights], webgl=webgl
     )
     for (x, y), seen in zip(lights, pictures, strict=True):
-        light = torch.from_numpy(light_at(x, y)[None].astype(np.float32))
+        light = torch.from_numpy(np.float32(light_at(x, y)[None]))
         geometry = Geometry.of(torch.from_numpy(normals[mask]), light, torch.zeros(len(tensor)))
         facets = facet_lobe(geometry, roughness, torch.full_like(roughness, GGX))
         painted = base * diffuse_lobe(geometry, torch.ones(1, 1)) + 0.08 * specular * facets

@@ -1,10 +1,10 @@
 """A page under the user's hands: mouse, keys, fingers and the ruler, in a browser."""
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
 
 from html_page import REPORT, SIDE, ball, light_at
+from scenes import parametrize
 from splinecli.results import pages as page_module
 from splinecli.results.pages import result_page
 
@@ -20,11 +20,11 @@ def lights_are(page, x, y, note):
     assert_allclose(page.evaluate("splinecli.light"), light_at(x, y), atol=0.02, err_msg=note)
 
 
-@pytest.mark.parametrize("webgl", [True, False])
+@parametrize("webgl", [True, False])
 def test_mouse_keys_and_a_narrow_screen(open_page, webgl):
     normals, mask = ball()
     report = {**REPORT, "capture": "x" * 300, "warnings": [{"code": "", "text": "y" * 300}]}
-    values = {"albedo": normals + 1, "confidence": mask.astype(np.float32)}
+    values = {"albedo": normals + 1, "confidence": np.float32(mask)}
     html = result_page(
         report, normals, mask, values=values, error_map_deg=np.where(mask, np.float32(3), np.nan)
     )
@@ -94,8 +94,7 @@ def test_the_address_leads_to_the_same_view(open_page):
     page.evaluate("splinecli.show(2, 80, 100)")
     page.evaluate("document.getElementById('tint').value = '#ffcc88'")
     wait_until(page, "location.hash.includes('zoom')")
-    fragment = page.evaluate("location.hash")[1:]
-    other = open_page(html, fragment, width=800, height=600)
+    other = open_page(html, page.evaluate("location.hash")[1:], width=800, height=600)
     other.evaluate("splinecli.ready")
     lights_are(other, 0.5, -0.25, "light")
     assert_allclose(other.evaluate("splinecli.region"), page.evaluate("splinecli.region"), atol=0.1)
@@ -152,7 +151,7 @@ def test_fingers(open_page):
     touch("touchEnd")
 
 
-@pytest.mark.parametrize("millimetres", [None, 0.25])
+@parametrize("millimetres", [None, 0.25])
 def test_the_ruler_has_the_unit_of_the_surface(open_page, monkeypatch, millimetres):
     """A line over half the width of a reduced map is 128 pixels of the whole map, also where the
     view is zoomed.

@@ -3,11 +3,11 @@
 import json
 
 import numpy as np
-import pytest
+from pytest import approx
 
-from scenes import read_json
+from scenes import parametrize, pinhole, read_json, refuses, tilted
 from splinecli.errors import UsageError
-from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.maths.normals import angle_between_deg
 from splinecli.pipeline.integrate import integrate_normal_map
 from splinecli.pipeline.options import IntegrateOptions, parse_level
 from splinecli.surface.levelling import level_heights, level_normals, plane_slopes
@@ -28,22 +28,22 @@ def plate(slopes=SLOPES, aspect=1.0):
     right, up = (
         np.where(inside, -axis / 30, 0) + slope for axis, slope in zip((x, y), slopes, strict=True)
     )
-    return heights, unit(np.stack((-right, -up, np.ones_like(right)), axis=-1))
+    return heights, tilted(-right, -up)
 
 
-@pytest.mark.parametrize("points", [(), ((60, 5), (75, 50), (50, 30))], ids=["plane", "points"])
-@pytest.mark.parametrize("aspect", [1.0, 2.5])
+@parametrize("points", [(), ((60, 5), (75, 50), (50, 30))], ids=["plane", "points"])
+@parametrize("aspect", [1.0, 2.5])
 def test_the_slope_of_the_plate_is_removed(points, aspect):
     heights, normals = plate(aspect=aspect)
     slopes = plane_slopes(heights, points, aspect=aspect)
-    assert slopes == pytest.approx(SLOPES, abs=0.003)
+    assert slopes == approx(SLOPES, abs=0.003)
     flat, flat_normals = plate((0.0, 0.0), aspect)
     assert np.ptp(level_heights(heights, slopes, aspect=aspect) - flat) < 0.5
     assert angle_between_deg(level_normals(normals, MASK, slopes), flat_normals).max() < 0.2
 
 
 def test_integrate_levels_depth_and_normals(tmp_path):
-    np.save(tmp_path / "n.npy", plate(aspect=2.0)[1].astype(np.float32))
+    np.save(tmp_path / "n.npy", np.float32(plate(aspect=2.0)[1]))
     options = IntegrateOptions(
         normals=tmp_path / "n.npy",
         level=(),
@@ -53,9 +53,7 @@ def test_integrate_levels_depth_and_normals(tmp_path):
     )
     report = integrate_normal_map(options)
     assert json.loads(json.dumps(report)) == read_json(tmp_path / "surface.json")
-    assert report["level"]["tilt_deg"] == pytest.approx(
-        np.degrees(np.arctan(np.hypot(*SLOPES))), abs=0.3
-    )
+    assert report["level"]["tilt_deg"] == approx(np.degrees(np.arctan(np.hypot(*SLOPES))), abs=0.3)
     assert {"level_normals.npy", "level_normals.png"} <= set(report["files"])
     depth = np.load(tmp_path / "depth.npy")
     true = 0.5 * plate((0.0, 0.0), 2.0)[0]
@@ -72,26 +70,26 @@ def test_levels_are_parsed():
         (5, 60),
     )
     for text in ("1,2 3,4", "flat", "1,2 3,4 5"):
-        with pytest.raises(UsageError, match="three points"):
+        with refuses("three points", UsageError):
             parse_level(text)
 
 
 def test_points_must_be_on_the_object_and_not_in_a_line():
     heights = plate()[0]
-    with pytest.raises(UsageError, match="the point 90,10 of --level is not on the object"):
+    with refuses("the point 90,10 of --level is not on the object", UsageError):
         plane_slopes(heights, ((1, 1), (5, 5), (90, 10)))
     for points in (((1, 1), (5, 5), (20, 20)), ((5, 5), (5, 5), (5, 5))):
-        with pytest.raises(UsageError, match="the points of --level are on one line"):
+        with refuses("the points of --level are on one line", UsageError):
             plane_slopes(heights, points)
     for line in (heights[:1], heights[:, :1], heights[:1, :1]):
-        with pytest.raises(UsageError, match="the pixels of the object are on one line"):
+        with refuses("the pixels of the object are on one line", UsageError):
             plane_slopes(line)
 
 
 def test_a_camera_matrix_contradicts_levelling(tmp_path):
-    np.save(tmp_path / "n.npy", plate()[1].astype(np.float32))
-    np.savetxt(tmp_path / "camera.txt", [[100, 0, 40], [0, 100, 30], [0, 0, 1]])
-    with pytest.raises(UsageError, match="orthographic"):
+    np.save(tmp_path / "n.npy", np.float32(plate()[1]))
+    np.savetxt(tmp_path / "camera.txt", pinhole(100, 40, 30))
+    with refuses("orthographic", UsageError):
         integrate_normal_map(
             IntegrateOptions(
                 normals=tmp_path / "n.npy", camera_matrix=tmp_path / "camera.txt", level=()

@@ -4,9 +4,11 @@ measured normals.
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 from glb_file import read_glb
+from scenes import parametrize, pinhole, refuses, tilted, vectors
 from splinecli.errors import UsageError
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.pixel_grid import Blocks
@@ -14,13 +16,13 @@ from splinecli.surface import mesh as mesh_module
 from splinecli.surface.mesh import Textures, decimated_mesh, surface_mesh, with_smooth_outline
 from splinecli.surface.surface_files import Surface, encode_surface
 
-CAMERA = np.array([[100.0, 0.0, 9.0], [0.0, 110.0, 7.0], [0.0, 0.0, 1.0]])
+CAMERA = pinhole(100, 9, 7, 110)
 
 
 ROWS, COLUMNS = np.mgrid[:15, :20]
 WAVE = 3 * np.sin(COLUMNS / 4) + ROWS / 5
-COLOURS = np.random.default_rng(0).integers(0, 256, (15, 20, 3), np.uint8)
-RAGGED = np.random.default_rng(1).uniform(size=(15, 20)) < 0.8
+COLOURS = default_rng(0).integers(0, 256, (15, 20, 3), np.uint8)
+RAGGED = default_rng(1).uniform(size=(15, 20)) < 0.8
 RAGGED[3, 4] = True
 
 
@@ -31,20 +33,19 @@ def face_normals(mesh):
 
 
 def test_four_pixels():
-    depth = np.array([[5.0, 0.0], [1.0, 4.0]])
-    mesh = surface_mesh(depth, np.ones((2, 2), bool))
-    assert_array_equal(
-        mesh.vertices, [[-0.5, 0.5, 5], [0.5, 0.5, 0], [-0.5, -0.5, 1], [0.5, -0.5, 4]]
-    )
+    mesh = surface_mesh(np.array([[5.0, 0.0], [1.0, 4.0]]), np.ones((2, 2), bool))
+    assert_array_equal(mesh.vertices, vectors("-0.5 0.5 5; 0.5 0.5 0; -0.5 -0.5 1; 0.5 -0.5 4"))
     # The edge between pixels 0 and 3, which are nearly as high.
     assert {frozenset(triangle) for triangle in mesh.triangles.tolist()} == {
         frozenset({0, 2, 3}),
         frozenset({0, 3, 1}),
     }
-    assert (mesh.vertices.dtype, mesh.triangles.dtype, mesh.colours) == (np.float32, np.int32, None)
+    assert mesh.vertices.dtype == np.float32
+    assert mesh.triangles.dtype == np.int32
+    assert mesh.colours is None
 
 
-@pytest.mark.parametrize("mask", [np.ones((15, 20), bool), RAGGED], ids=["full", "ragged"])
+@parametrize("mask", [np.ones((15, 20), bool), RAGGED], ids=["full", "ragged"])
 def test_triangles_tile_the_mask_and_face_the_camera(mask):
     mesh = surface_mesh(WAVE, mask)
     assert len(mesh.vertices) == np.count_nonzero(mask)
@@ -91,7 +92,7 @@ def test_the_outline_of_a_disc_is_round():
     assert_allclose(smooth.vertices[:, 0] / 91 + 0.5, smooth.uvs[:, 0], atol=1e-6)
 
 
-@pytest.mark.parametrize("camera", [None, CAMERA])
+@parametrize("camera", [None, CAMERA])
 def test_steps_are_left_open(camera):
     height = np.repeat([0.0, 10.0], [4, 5])[None] + np.zeros((6, 1))
     # A step of 10 pixels at a focal length of sqrt(100 * 110).
@@ -106,7 +107,7 @@ def test_steps_are_left_open(camera):
     cut = surface_mesh(depth, mask, camera, largest_step=9.99)
     assert len(cut.triangles) == 70
     assert (np.ptp(cut.vertices[cut.triangles, 2], axis=1) < 1e-5).all()
-    with pytest.raises(UsageError, match="the largest step is -1, expected"):
+    with refuses("the largest step is -1, expected", UsageError):
         surface_mesh(depth, mask, largest_step=-1)
 
 
@@ -117,7 +118,7 @@ def test_pixels_without_triangles():
         assert_array_equal(mesh.normals, np.tile((0, 0, 1), (len(mesh.vertices), 1)))
 
 
-@pytest.mark.parametrize("camera", [None, CAMERA])
+@parametrize("camera", [None, CAMERA])
 def test_attributes_of_vertices(camera):
     colours, normal_map, mask = COLOURS, np.zeros((15, 20, 3)), RAGGED
     normal_map[..., 2] = 1
@@ -141,18 +142,17 @@ def test_normals_of_the_triangles():
     assert_allclose(mesh.normals, np.tile(slope / np.linalg.norm(slope), (300, 1)), atol=1e-6)
 
 
-RNG = np.random.default_rng(0)
+RNG = default_rng(0)
 MASK = np.hypot(*np.mgrid[-20:20, -25:25]) < 18
 
 
-@pytest.mark.parametrize("share", [1.0, 0.01])
+@parametrize("share", [1.0, 0.01])
 def test_the_number_of_blocks_is_bounded_for_scattered_pixels(share):
     mask = RNG.random((300, 400)) < share
-    blocks = Blocks.over(mask, 100)
-    assert 50 <= np.count_nonzero(blocks.mask) <= 200
+    assert 50 <= np.count_nonzero(Blocks.over(mask, 100).mask) <= 200
 
 
-@pytest.mark.parametrize("step", [1, 3, 7])
+@parametrize("step", [1, 3, 7])
 def test_samples_are_those_of_scipy(step):
     blocks = Blocks.of_step(MASK, step)
     values = RNG.random((np.count_nonzero(blocks.mask), 2)).astype(np.float32)
@@ -164,7 +164,7 @@ def test_samples_are_those_of_scipy(step):
 
 
 SIDE = 90
-CAMERA_OF_SPHERE = np.array([[120.0, 0.0, 40.0], [0.0, 130.0, 47.0], [0.0, 0.0, 1.0]])
+CAMERA_OF_SPHERE = pinhole(120, 40, 47, 130)
 
 
 def measured(columns, rows):
@@ -174,7 +174,7 @@ def measured(columns, rows):
     across, up = (columns - 44.5) / 60, (44.5 - rows) / 60
     x = across + 0.35 * np.sin(columns / 2.5) * np.cos(rows / 4)
     y = up + 0.35 * np.cos(columns / 3) * np.sin(rows / 2)
-    return unit(np.stack((x, y, np.ones_like(x)), axis=-1))
+    return tilted(x, y)
 
 
 def height_of_dome(columns, rows):
@@ -208,14 +208,14 @@ def decimated(camera):
     )
 
 
-def test_normals_relit_from_the_file(decimated):
+def test_normals_relit_from_the_file(decimated, rng):
     full = surface_mesh(*dome(None)[0])
     assert 0.04 < len(decimated.triangles) / len(full.triangles) <= 0.05
     ((_, content),) = encode_surface(Surface(np.zeros((1, 1)), decimated, "pixel", 1.0), ["glb"])
     _, arrays = read_glb(content)
     assert (arrays["TANGENT"][:, 3] == 1).all()
     # Ten points in each triangle.
-    weights = np.random.default_rng(0).dirichlet((1, 1, 1), (10, len(arrays["indices"])))
+    weights = rng.dirichlet((1, 1, 1), (10, len(arrays["indices"])))
     uv, smooth, tangent = (
         np.einsum("ktc,tcx->ktx", weights, arrays[name][arrays["indices"]]).reshape(
             -1, arrays[name].shape[1]
@@ -272,7 +272,7 @@ def test_vertices_stay_on_the_dome_and_in_their_places(decimated, camera):
     assert np.abs(decimated.vertices[:, 2] - depth).mean() * scale < 0.2  # pixels
 
 
-@pytest.mark.parametrize("odd", [0, 1])
+@parametrize("odd", [0, 1])
 def test_blocks_of_a_large_map_have_its_shape(camera, odd, monkeypatch):
     """With few triangles asked for, those of blocks are decimated: they lie on the dome, in their
     places.

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from pytest import approx
 
-from splinecli.errors import InputError
+from scenes import parametrize, pinhole, refuses
 from splinecli.surface.mesh import decimated_mesh, surface_mesh
 from splinecli.surface.solid import close_mesh
 
@@ -27,12 +28,11 @@ def check_closed(solid):
 
 
 def volume(solid):
-    corners = solid.vertices[solid.triangles].astype(np.float64)
-    return float(np.linalg.det(corners).sum() / 6)
+    return float(np.linalg.det(np.float64(solid.vertices[solid.triangles])).sum() / 6)
 
 
-@pytest.mark.parametrize("largest_step", [None, 2.0])
-@pytest.mark.parametrize("mask", [FULL, RAGGED], ids=["full", "ragged"])
+@parametrize("largest_step", [None, 2.0])
+@parametrize("mask", [FULL, RAGGED], ids=["full", "ragged"])
 def test_volume_over_the_triangles(mask, largest_step):
     depth = WAVE + 30 * (np.arange(40) > 25)  # a step, whose wall may be left out
     mesh = surface_mesh(depth, mask, largest_step=largest_step)
@@ -41,20 +41,20 @@ def test_volume_over_the_triangles(mask, largest_step):
     back = solid.vertices[:, 2].min()
     heights = solid.vertices[solid.triangles, 2]
     corners = solid.vertices[solid.triangles[(heights > back).all(axis=1)]]
-    assert corners[..., 2].min() - back == pytest.approx(2.5, abs=1e-5)
+    assert corners[..., 2].min() - back == approx(2.5, abs=1e-5)
     # Seen along the axis, each triangle is half a pixel.
     above = corners[..., 2].mean(axis=1, dtype=np.float64) - back
-    assert volume(solid) == pytest.approx(0.5 * above.sum(), rel=1e-6)
+    assert volume(solid) == approx(0.5 * above.sum(), rel=1e-6)
     # Few triangles touch the others at a corner only.
     assert len(corners) > 0.9 * len(mesh.triangles)
 
 
 def test_a_perspective_plate():
-    camera = np.array([[100.0, 0, 19.5], [0, 100, 14.5], [0, 0, 1]])
+    camera = pinhole(100, 19.5, 14.5)
     solid = close_mesh(surface_mesh(np.full(SHAPE, 50.0), FULL, camera), 5, perspective=True)
     check_closed(solid)
     # the difference of two pyramids
-    assert volume(solid) == pytest.approx(39 * 29 * (55**3 - 50**3) / 3 / 100**2, rel=1e-5)
+    assert volume(solid) == approx(39 * 29 * (55**3 - 50**3) / 3 / 100**2, rel=1e-5)
     assert_allclose(np.ptp(solid.vertices[:, :2], axis=0), 55 * np.array((39, 29)) / 100, rtol=1e-6)
 
 
@@ -70,5 +70,5 @@ def test_a_decimated_mesh():
 def test_a_surface_without_triangles():
     line = np.zeros(SHAPE, bool)
     line[5] = True
-    with pytest.raises(InputError, match="or leave --solid out"):
+    with refuses("or leave --solid out"):
         close_mesh(surface_mesh(WAVE, line), 1.0, perspective=False)

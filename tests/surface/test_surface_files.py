@@ -4,13 +4,13 @@ import io
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
+from pytest import approx
 
 from glb_file import read_glb
-from splinecli.errors import InputError
+from scenes import parametrize, refuses
 from splinecli.maths.transfer import decode_transfer
 from splinecli.surface.mesh import Textures, surface_mesh, with_smooth_outline
 from splinecli.surface.surface_files import GRAY, Surface, encode_surface
@@ -35,7 +35,7 @@ def load(content, form):
     )
 
 
-@pytest.mark.parametrize("coloured", [False, True])
+@parametrize("coloured", [False, True])
 def test_ply_and_stl(coloured):
     mesh = wave(coloured)
     stl = load(encode(mesh, "stl")["mesh.stl"], "stl")
@@ -56,7 +56,7 @@ def test_ply_and_stl(coloured):
         assert_array_equal(read.visual.vertex_colors[:, :3], COLOURS.reshape(-1, 3))
 
 
-@pytest.mark.parametrize("coloured", [False, True])
+@parametrize("coloured", [False, True])
 def test_obj(coloured, tmp_path):
     mesh = wave(coloured)
     files = encode(mesh, "obj", unit="millimetre")
@@ -77,7 +77,7 @@ def test_obj(coloured, tmp_path):
         assert_array_equal(np.asarray(read.visual.material.image), COLOURS)
 
 
-@pytest.mark.parametrize("coloured", [False, True])
+@parametrize("coloured", [False, True])
 def test_glb(coloured):
     mesh = wave(coloured)
     content = encode(mesh, "glb", millimetres=2)["mesh.glb"]
@@ -98,16 +98,14 @@ def test_glb(coloured):
     if coloured:
         assert_array_equal(arrays["colour"], COLOURS)
     else:
-        assert matte["baseColorFactor"] == pytest.approx([GRAY / 255] * 3 + [1])
+        assert matte["baseColorFactor"] == approx([GRAY / 255] * 3 + [1])
     [read] = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()  # type: ignore[attr-defined]
     assert len(read.faces) == len(mesh.triangles)
 
 
 def glossy(specular):
-    gloss = np.dstack((np.full(SHAPE, 255), np.full(SHAPE, 102), np.zeros(SHAPE))).astype(np.uint8)
-    return replace(
-        wave(), gloss=gloss, specular=np.broadcast_to(specular, SHAPE).astype(np.float32)
-    )
+    gloss = np.uint8(np.dstack((np.full(SHAPE, 255), np.full(SHAPE, 102), np.zeros(SHAPE))))
+    return replace(wave(), gloss=gloss, specular=np.float32(np.broadcast_to(specular, SHAPE)))
 
 
 def test_reflectance_of_glb():
@@ -119,7 +117,7 @@ def test_reflectance_of_glb():
     tree, arrays = read_glb(content)
     extension = tree["materials"][0]["extensions"]["KHR_materials_specular"]
     colour = (
-        decode_transfer(arrays["specular"].astype(np.float32) / 255, None)
+        decode_transfer(np.float32(arrays["specular"]) / 255, None)
         * extension["specularColorFactor"]
     )
     assert_allclose(0.04 * colour[3, :, 1], 0.08 * specular, rtol=0.02)
@@ -154,8 +152,8 @@ def test_gloss_of_obj(tmp_path):
     assert not np.asarray(Image.open(tmp_path / "mesh_metalness.png")).any()
     # At a roughness of 0.4, facets of 4 % reflect 0.04 / (4 x 0.4^4) of a white matte surface in
     # the mirror direction.
-    assert float(lines["Ks"].split()[0]) == pytest.approx(0.04 / (4 * 0.4**4), abs=0.003)
-    assert float(lines["Ns"]) == pytest.approx(2 / 0.4**4 - 2)
+    assert float(lines["Ks"].split()[0]) == approx(0.04 / (4 * 0.4**4), abs=0.003)
+    assert float(lines["Ns"]) == approx(2 / 0.4**4 - 2)
     read = trimesh.load_mesh(tmp_path / "mesh.obj", process=False, maintain_order=True)
     assert_array_equal(np.asarray(read.visual.material.image), COLOURS)
 
@@ -165,5 +163,5 @@ def test_a_mesh_without_triangles():
     assert b"element vertex 15\n" in encode(mesh, "ply")["mesh.ply"]
     assert encode(mesh, "obj")["mesh.obj"].count(b"\nv ") == 15
     assert len(encode(mesh, "stl")["mesh.stl"]) == 84
-    with pytest.raises(InputError, match="the mesh has no triangles, because no three pixels"):
+    with refuses("the mesh has no triangles, because no three pixels"):
         encode(mesh, "glb")

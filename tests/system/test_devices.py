@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from scenes import put
+from scenes import parametrize, put, refuses
 from splinecli.errors import UsageError
 from splinecli.system import machine
 from splinecli.system.machine import (
@@ -18,7 +18,7 @@ from splinecli.system.machine import (
 )
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "name, available, chosen",
     [("auto", True, "cuda"), ("auto", False, "cpu"), ("cpu", True, "cpu"), ("cuda", True, "cuda")],
 )
@@ -27,13 +27,16 @@ def test_choice(monkeypatch, name, available, chosen):
     assert choose_device(name).type == chosen
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "name, problem",
-    [("gpu", "no device named 'gpu'; expected auto, cpu or cuda"), ("cuda", "no CUDA device")],
+    """
+gpu | no device named 'gpu'; expected auto, cpu or cuda
+cuda | no CUDA device
+""",
 )
 def test_devices_that_are_not_there(monkeypatch, name, problem):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(UsageError, match=problem):
+    with refuses(problem, UsageError):
         choose_device(name)
 
 
@@ -46,7 +49,7 @@ def test_automatic_precision_agrees_with_the_kernel_s_list_of_instructions():
     assert choose_precision("auto", torch.device("cpu")) == ("bfloat16" if native else "float32")
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("limit", "has_bfloat16"),
     [("AVX2", False), ("AVX512_CORE", False), ("avx512_core_bf16", True), ("DEFAULT", True)],
 )
@@ -95,7 +98,7 @@ QUOTAS = {
 }
 
 
-@pytest.mark.parametrize("case", QUOTAS)
+@parametrize("case", QUOTAS)
 def test_quotas_of_control_groups(mount, case):
     """The groups above limit a process, too."""
     groups, files, expected = QUOTAS[case]
@@ -138,7 +141,7 @@ def test_memory_left_in_control_groups_of_version_1(mount, monkeypatch):
     assert available_memory() == 8e9
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "cores, affinity, quotas, expected",
     [(8, 8, [], 8), (8, 3, [], 3), (8, 8, [2.5, 4], 2), (8, 8, [0.5], 1), (None, 1, [], 1)],
 )
@@ -149,7 +152,7 @@ def test_available_cores(cores, affinity, quotas, expected, monkeypatch):
     assert machine.count_available_cores() == expected
 
 
-@pytest.mark.parametrize("threads, cores, expected", [(8, 2, 2), (1, 4, 1), (2, 2, 2)])
+@parametrize("threads, cores, expected", [(8, 2, 2), (1, 4, 1), (2, 2, 2)])
 def test_threads_are_only_ever_lowered(threads, cores, expected, monkeypatch):
     now = [threads]
     monkeypatch.setattr(torch, "get_num_threads", lambda: now[0])
@@ -159,14 +162,14 @@ def test_threads_are_only_ever_lowered(threads, cores, expected, monkeypatch):
     assert now[0] == expected
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "module, extra, named",
-    [
-        ("embreex.rtcore_scene", "render", "embreex and scikit-image"),
-        ("fast_simplification", "mesh", "fast-simplification"),
-    ],
+    """
+embreex.rtcore_scene | render | embreex and scikit-image
+fast_simplification | mesh | fast-simplification
+""",
 )
 def test_the_message_names_the_packages_and_the_command(module, extra, named, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(UsageError, match=rf"{named}.*Run pip install 'splinecli\[{extra}\]'"):
+    with refuses(rf"{named}.*Run pip install 'splinecli\[{extra}\]'", UsageError):
         import_extra(module, extra)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from kills import content, killed_at_every_step, missing_syncs, record_calls
+from scenes import parametrize, put, refuses
 from splinecli.errors import OutputError
 from splinecli.system import files
 from splinecli.system.files import UNFINISHED, parse_json, write_bytes, write_text
@@ -50,7 +51,7 @@ def publish(folder, contents=NEW):
 FULL = OSError(errno.ENOSPC, "No space left on device")
 
 
-@pytest.mark.parametrize("first", [True, False])
+@parametrize("first", [True, False])
 def test_a_folder_with_a_report_is_whole_after_a_kill_at_any_step(tmp_path, first):
     reports, old = [], MINE if first else OLD | MINE
     for folder in killed_at_every_step(tmp_path, lambda folder: write(folder, old), publish):
@@ -114,10 +115,10 @@ def test_ctrl_c_between_renames_leaves_no_report(tmp_path, monkeypatch):
 def test_a_folder_in_the_place_of_a_file(tmp_path):
     (tmp_path / "a.txt").mkdir()
     (tmp_path / "pictures").touch()
-    with pytest.raises(OutputError, match=r"a\.txt: found a folder, expected a file"):
+    with refuses(r"a\.txt: found a folder, expected a file", OutputError):
         publish(tmp_path)
     (tmp_path / "a.txt").rmdir()
-    with pytest.raises(OutputError, match="pictures: found a file, expected a folder"):
+    with refuses("pictures: found a file, expected a folder", OutputError):
         publish(tmp_path)
     assert content(tmp_path) == {"pictures": b""}
 
@@ -132,8 +133,8 @@ LINKS = {
 }
 
 
-@pytest.mark.parametrize("kind", LINKS)
-@pytest.mark.parametrize("name", [REPORT, "a.txt", "only old.txt", "pictures/1.png"])
+@parametrize("kind", LINKS)
+@parametrize("name", [REPORT, "a.txt", "only old.txt", "pictures/1.png"])
 def test_what_stands_in_a_file_s_place_is_replaced_and_not_followed(tmp_path, kind, name):
     folder, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
     write(elsewhere, {"precious": b"mine"})
@@ -151,9 +152,7 @@ def test_a_link_in_the_place_of_a_subfolder_is_refused(tmp_path):
     write(folder, {REPORT: b"old"})
     (folder / "pictures").symlink_to(elsewhere)
     for contents in (NEW, {REPORT: b"new"}):  # with a file to write there, or only one to remove
-        with pytest.raises(
-            OutputError, match="pictures: found a link, expected a folder"
-        ) as caught:
+        with refuses("pictures: found a link, expected a folder", OutputError) as caught:
             publish(folder, contents)
         assert caught.value.exit_code == 5
     assert content(elsewhere) == {"1.png": b"mine"}
@@ -164,7 +163,7 @@ def test_a_folder_made_for_nothing_goes_again(tmp_path):
     for name in ("new/deeper", "old"):
         with pytest.raises(ZeroDivisionError), held_folder(tmp_path / name):
             raise ZeroDivisionError
-    assert [path.name for path in tmp_path.iterdir()] == ["old"]
+    assert names_in(tmp_path) == {"old"}
 
 
 def test_what_a_killed_process_was_writing_goes(tmp_path):
@@ -212,7 +211,8 @@ def system(request, monkeypatch):
     if request.param == "windows":
 
         def locking(handle, mode, count):
-            assert (mode, count) == (2, 1)
+            assert mode == 2
+            assert count == 1
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -228,7 +228,7 @@ def system(request, monkeypatch):
 def test_a_folder_is_held_by_one_at_a_time(tmp_path):
     with (
         locked(tmp_path / "run"),
-        pytest.raises(BusyError, match="run: another splinecli process is writing to this folder"),
+        refuses("run: another splinecli process is writing to this folder", BusyError),
         locked(tmp_path / "run"),
     ):
         pytest.fail("two at once")
@@ -241,13 +241,13 @@ def test_a_folder_is_held_by_one_at_a_time(tmp_path):
 def test_one_at_a_time_also_while_the_lock_file_is_removed(tmp_path):
     """Each process adds one to a number in a file: with two at once, some would be lost."""
     number, children = tmp_path / "number", []
-    number.write_text("0")
+    put(number, "0")
     for _ in range(3):
         child = os.fork()
         if child == 0:
             for _ in range(20):
                 with locked(tmp_path, wait=True):
-                    number.write_text(str(int(number.read_text()) + 1))
+                    put(number, str(int(number.read_text()) + 1))
             os._exit(0)
         children.append(child)
     assert all(os.waitpid(child, 0)[1] == 0 for child in children)
@@ -275,7 +275,7 @@ def test_the_lock_file_of_another_user(tmp_path, monkeypatch):
         r"\.lock: this lock file belongs to another user.*remove the file\. Otherwise, choose "
         r"another -o"
     )
-    with pytest.raises(OutputError, match=message), locked(tmp_path):
+    with refuses(message, OutputError), locked(tmp_path):
         pytest.fail("it has no lock")
     monkeypatch.undo()
     assert (tmp_path / LOCK).exists()
@@ -313,12 +313,12 @@ def test_folders_made_for_nothing_go_again(tmp_path, monkeypatch):
     monkeypatch.setattr(
         "splinecli.system.files.sync", Mock(side_effect=OSError(28, "No space left on device"))
     )
-    with pytest.raises(OutputError, match="No space left"):
+    with refuses("No space left", OutputError):
         write_bytes(tmp_path / "a" / "b" / "out.bin", b"content")
     assert names_in(tmp_path) == []
 
 
-@pytest.mark.parametrize("text", ["[" * 200_000, '{"a": ' + "9" * 400 + "}", "9" * 5000, "{", ""])
+@parametrize("text", ["[" * 200_000, '{"a": ' + "9" * 400 + "}", "9" * 5000, "{", ""])
 def test_json_that_cannot_be_used_is_a_value_error(text):
     with pytest.raises(ValueError):
         parse_json(text)

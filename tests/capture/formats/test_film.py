@@ -2,14 +2,14 @@
 
 import os
 import shutil
-import subprocess
-import sys
 
 import cv2
 import numpy as np
 import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 
-from scenes import directions_at, shade, sphere
+from scenes import directions_at, parametrize, refuses, run_python, shade, sphere
 from splinecli.capture.formats.facts import read_header
 from splinecli.capture.formats.film import (
     FEWEST_FRAMES,
@@ -18,7 +18,6 @@ from splinecli.capture.formats.film import (
     is_film,
     read_frames,
 )
-from splinecli.errors import InputError
 from splinecli.maths.transfer import BT709, decode_transfer
 from splinecli.pictures.maps import encode_png
 
@@ -35,11 +34,11 @@ def sphere_film(lights, texture=0.3):
     with noise.
     """
     normals, inside = sphere(SIZE)
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     albedo = inside * (0.9 - texture * rng.uniform(size=inside.shape))
     linear = np.moveaxis(shade(normals, lights), 2, 0) * albedo
     linear = linear + 0.003 * rng.normal(size=linear.shape)
-    return np.rint(255 * encode_bt709(linear.clip(0, 1))).astype(np.uint8)
+    return np.uint8(np.rint(255 * encode_bt709(linear.clip(0, 1))))
 
 
 def write_film(path, frames, codec="MJPG"):
@@ -56,7 +55,13 @@ def path_of_lamp(count):
     return directions_at(np.linspace(0, 6 * np.pi, count), np.radians(np.linspace(15, 50, count)))
 
 
-@pytest.mark.parametrize("name, codec", [("clip.avi", "MJPG"), ("clip.mp4", "mp4v")])
+@parametrize(
+    "name, codec",
+    """
+clip.avi | MJPG
+clip.mp4 | mp4v
+""",
+)
 def test_frames_under_different_lights_are_chosen(tmp_path, name, codec):
     lights, frames = path_of_lamp(150), sphere_film(path_of_lamp(150))
     film = write_film(tmp_path / name, frames, codec)
@@ -74,7 +79,7 @@ def test_blurred_overexposed_and_dark_frames_are_not_chosen(tmp_path):
     blurred, bright, dark = range(20, 24), range(60, 63), range(90, 94)
     for number in blurred:
         frames[number] = cv2.GaussianBlur(frames[number], (0, 0), 3)
-    frames[bright] = np.minimum(frames[bright] * 2.5, 255).astype(np.uint8)
+    frames[bright] = np.uint8(np.minimum(frames[bright] * 2.5, 255))
     frames[dark] //= 8
     chosen = choose_frames(write_film(tmp_path / "clip.avi", frames))
     assert not {*blurred, *bright, *dark}.intersection(chosen)
@@ -82,11 +87,11 @@ def test_blurred_overexposed_and_dark_frames_are_not_chosen(tmp_path):
 
 def test_the_curve_is_undone():
     linear = np.linspace(0, 1, 256)
-    stored = encode_bt709(linear).astype(np.float32)
-    np.testing.assert_allclose(decode_transfer(stored, BT709), linear, atol=2e-4)
+    stored = np.float32(encode_bt709(linear))
+    assert_allclose(decode_transfer(stored, BT709), linear, atol=2e-4)
 
 
-@pytest.mark.parametrize("number, curve", [(1, BT709), (8, 1.0), (13, None)])
+@parametrize("number, curve", [(1, BT709), (8, 1.0), (13, None)])
 def test_code_points_go_before_other_curves(tmp_path, number, curve):
     """cICP, ITU-T H.273: BT.709, linear and sRGB. 16 and 18 are those of films with a high dynamic
     range.
@@ -109,7 +114,7 @@ def test_what_is_no_film_or_truncated_is_refused(tmp_path):
         path = tmp_path / "clip.mp4"
         path.write_bytes(content)
         assert is_film(path)
-        with pytest.raises(InputError, match=problem):
+        with refuses(problem):
             choose_frames(path)
     for name, codec, message in (
         ("clip.mp4", "mp4v", "damaged"),  # the index at the end is missing
@@ -117,7 +122,7 @@ def test_what_is_no_film_or_truncated_is_refused(tmp_path):
     ):
         film = write_film(tmp_path / name, sphere_film(path_of_lamp(40)), codec)
         film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
-        with pytest.raises(InputError, match=message):
+        with refuses(message):
             choose_frames(film)
 
 
@@ -131,12 +136,12 @@ def test_a_film_whose_name_is_not_utf8(tmp_path):
         pytest.skip("the file system has no such names")
     chosen = choose_frames(other)
     assert chosen == choose_frames(film)
-    np.testing.assert_array_equal(list(read_frames(other, chosen)), list(read_frames(film, chosen)))
+    assert_array_equal(list(read_frames(other, chosen)), list(read_frames(film, chosen)))
 
 
 def test_what_ffmpeg_prints_of_a_damaged_film_is_caught(tmp_path):
     """Its threads also print between the calls, so a process of its own reads the film, slowly."""
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     film = write_film(tmp_path / "clip.avi", sphere_film(path_of_lamp(100)), "XVID")
     content = bytearray(film.read_bytes())
     for place in rng.integers(9000, len(content) - 9000, 100):
@@ -149,5 +154,5 @@ from splinecli.capture.formats.film import read_frames
 for _ in read_frames(Path(sys.argv[1]), range(0, 60, 2)):
     time.sleep(0.01)
 """
-    done = subprocess.run([sys.executable, "-c", code, str(film)], capture_output=True, text=True)
+    done = run_python(code, film)
     assert (done.returncode, done.stderr) == (0, "")

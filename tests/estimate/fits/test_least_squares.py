@@ -5,13 +5,21 @@ halves of the lights.
 import numpy as np
 import pytest
 import torch
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from scipy.optimize import linprog
 from torch.nn.functional import normalize, pad
 from torch.testing import assert_close
 
 from distributions import seeded
-from scenes import cap_directions, directions_at, ring_lights, spiral_lights
+from scenes import (
+    assert_unit,
+    cap_directions,
+    directions_at,
+    parametrize,
+    ring_lights,
+    spiral_lights,
+)
 from splinecli.estimate.fits.least_squares import (
     RIDGE,
     SMALLEST_VARIANCE,
@@ -32,18 +40,18 @@ ROBUST = ("iw12", "l1", "ls-trimmed")
 
 def estimate(name, observations, lights):
     return make_estimator(name, MethodOptions(device="cpu")).estimate(
-        observations.astype(np.float32), lights
+        np.float32(observations), lights
     )
 
 
-@pytest.mark.parametrize("name", ROBUST)
+@parametrize("name", ROBUST)
 def test_exact_on_matte_pixels(name, matte_pixels):
     normals, lights, observations = matte_pixels
     # What is left is the rounding of the observations to float32, 6e-8 of each.
     assert angle_between_deg(estimate(name, observations, lights), normals).max() < 1e-3
 
 
-@pytest.mark.parametrize("name", ROBUST)
+@parametrize("name", ROBUST)
 def test_exact_in_spite_of_a_highlight_and_a_cast_shadow(name, matte_pixels):
     normals, lights, observations = matte_pixels
     spoilt = observations.copy()
@@ -60,8 +68,7 @@ def test_exact_in_spite_of_a_highlight_and_a_cast_shadow(name, matte_pixels):
 def test_iw12_fixed_point(matte_pixels):
     """The result solves eq. 11 for the variances that it gives rise to, written out with LAPACK."""
     _, lights, observations = matte_pixels
-    rng = np.random.default_rng(2)
-    observations = observations[:10] * rng.uniform(0.7, 1.3, (10, 12))
+    observations = observations[:10] * default_rng(2).uniform(0.7, 1.3, (10, 12))
     observations /= observations.max(axis=1, keepdims=True)
     found = solve_iw12(torch.tensor(observations), torch.tensor(lights), iterations=3000).numpy()
     for pixel, b in zip(observations, found, strict=True):
@@ -77,8 +84,7 @@ def test_iw12_fixed_point(matte_pixels):
         assert_allclose(b, solution, rtol=1e-5)
 
 
-def test_l1_is_the_linear_programme_s_optimum():
-    rng = np.random.default_rng(0)
+def test_l1_is_the_linear_programme_s_optimum(rng):
     lights = unit(rng.normal(size=(10, 3)) * (0.4, 0.4, 0.1) + (0, 0, 1))
     observations = rng.uniform(size=(30, 10))
     found = solve_l1(torch.tensor(observations), torch.tensor(lights)).numpy()
@@ -94,10 +100,9 @@ def test_l1_is_the_linear_programme_s_optimum():
     assert max(excess) < 4e-3
 
 
-@pytest.mark.parametrize("count, dropped", [(3, 0), (4, 0), (5, 0), (6, 1), (10, 2), (96, 19)])
-def test_trimmed_ends(count, dropped):
+@parametrize("count, dropped", [(3, 0), (4, 0), (5, 0), (6, 1), (10, 2), (96, 19)])
+def test_trimmed_ends(count, dropped, rng):
     """Moving a trimmed observation further out changes nothing; moving the next one does."""
-    rng = np.random.default_rng(0)
     lights = torch.tensor(rng.normal(size=(count, 3)))
     observations = torch.tensor(rng.permutation(np.linspace(0.1, 1, count))[None])
     order = observations[0].argsort()
@@ -110,22 +115,20 @@ def test_trimmed_ends(count, dropped):
     assert not torch.allclose(solve_trimmed(outer, lights), before)
 
 
-def test_lights_that_span_a_plane_or_a_line_give_finite_normals():
+def test_lights_that_span_a_plane_or_a_line_give_finite_normals(rng):
     """Three directions, each many times: under IW12's weights one of them may drop out, then
     another.
     """
-    rng = np.random.default_rng(0)
     for spanned in (1, 2, 3):
         rows = rng.normal(size=(spanned, 3)) * (0.4, 0.4, 0.1) + (0, 0, 1)
         lights = unit(rows)[np.arange(12) % spanned]
-        observations = rng.uniform(size=(2000, 12)).astype(np.float32)
+        observations = np.float32(rng.uniform(size=(2000, 12)))
         for name in ROBUST:
             found = estimate(name, observations, lights)
-            assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
+            assert_unit(found)
 
 
-def test_weighted_step_against_lapack():
-    rng = np.random.default_rng(0)
+def test_weighted_step_against_lapack(rng):
     lights, observations = rng.normal(size=(7, 3)), rng.uniform(size=(5, 7))
     weight = 10.0 ** rng.uniform(-6, 6, (5, 7))
     solution, covariance = weighted_least_squares(
@@ -195,7 +198,7 @@ ROWS, COLUMNS = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
 
 
 def positive_matrices(count, rank=3):
-    factors = np.random.default_rng(0).normal(size=(count, 3, rank))
+    factors = default_rng(0).normal(size=(count, 3, rank))
     return np.asarray(factors @ factors.transpose(0, 2, 1))
 
 
@@ -224,8 +227,8 @@ def test_numpy_and_torch_agree_to_the_last_bit():
     )
 
 
-@pytest.mark.parametrize("rank", [0, 1, 2])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@parametrize("rank", [0, 1, 2])
+@parametrize("dtype", [np.float32, np.float64])
 def test_inverse_of_a_singular_matrix_is_positive(rank, dtype):
     inverted = inverse(positive_matrices(100, rank).astype(dtype), 1e-6, "numpy")
     assert np.isfinite(inverted).all()
@@ -233,7 +236,7 @@ def test_inverse_of_a_singular_matrix_is_positive(rank, dtype):
 
 
 def test_product_with_a_vector():
-    matrices, vectors = positive_matrices(50), np.random.default_rng(1).normal(size=(50, 3))
+    matrices, vectors = positive_matrices(50), default_rng(1).normal(size=(50, 3))
     entries = [matrices[:, i, j] for i, j in zip(ROWS, COLUMNS, strict=True)]
     found, expected = (
         multiply_symmetric(entries, vectors.T),
@@ -276,8 +279,8 @@ def test_the_change_is_half_the_difference_of_two_halves():
     assert min(differences) < 0.02 * expected.abs().max()
 
 
-@pytest.mark.parametrize("square", [False, True])
-@pytest.mark.parametrize("count", [4, 5, 10, 40])
+@parametrize("square", [False, True])
+@parametrize("count", [4, 5, 10, 40])
 def test_noise_is_as_large_as_the_random_errors(count, square):
     """Also on a ring of four lights, whose residuals alternate as the signs of the halves do."""
     ring = directions_at(2 * np.pi * np.arange(count) / count, np.radians(35))

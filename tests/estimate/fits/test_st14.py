@@ -5,18 +5,17 @@ and SciPy.
 from math import comb
 
 import numpy as np
-import pytest
 import quadprog
 import torch
+from numpy.random import default_rng
+from pytest import approx
 
-from scenes import Floats, cap_directions, halfway
+from scenes import cap_directions, halfway, parametrize
 from splinecli.estimate.fits.ia14 import fit_ia14
 from splinecli.estimate.fits.st14 import solve_st14
 from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.maths.normals import angle_between_deg
-
-Array = Floats
 
 
 def half_cosines(normals, lights):
@@ -30,7 +29,7 @@ def bipolynomial(normals, lights):
     as the model's definition has it.
     """
     half, difference = half_cosines(normals, lights)
-    coefficients = np.random.default_rng(5).uniform(-0.3, 0.3, (len(normals), 3, 3))
+    coefficients = default_rng(5).uniform(-0.3, 0.3, (len(normals), 3, 3))
     coefficients[:, 0, 0] = 1
     powers = np.arange(3)
     reflectance = np.einsum(
@@ -44,13 +43,12 @@ def bipolynomial(normals, lights):
 
 def estimate(observations, lights):
     estimator = make_estimator("st14", MethodOptions(device="cpu"))
-    return estimator.estimate(observations.astype(np.float32), lights).astype(np.float64)
+    return np.float64(estimator.estimate(np.float32(observations), lights))
 
 
 def solved(observations, lights):
     scaled = observations / observations.max(axis=1, keepdims=True)
-    normals = solve_st14(torch.from_numpy(scaled), torch.from_numpy(lights)).numpy()
-    return normals
+    return solve_st14(torch.from_numpy(scaled), torch.from_numpy(lights)).numpy()
 
 
 # All lights are within 38 degrees of the camera, all normals within 50: nothing is shadowed.
@@ -62,7 +60,7 @@ OBSERVATIONS = bipolynomial(TRUTH, LIGHTS)
 def with_highlights(observations, untouched):
     """All but the lowest of a pixel's observations up to six times as bright."""
     rank = observations.argsort(axis=1).argsort(axis=1)
-    gain = np.random.default_rng(7).uniform(0, 5, observations.shape)
+    gain = default_rng(7).uniform(0, 5, observations.shape)
     return observations * (1 + gain * (rank >= untouched))
 
 
@@ -80,7 +78,7 @@ def test_highlights_in_the_brightest_observations_change_nothing():
     assert angle_between_deg(estimate(bright, LIGHTS), TRUTH).max() < 0.1
 
 
-@pytest.mark.parametrize("count, cast", [(4, 0.0), (6, 0.0), (10, 0.0), (64, 0.1)])
+@parametrize("count, cast", [(4, 0.0), (6, 0.0), (10, 0.0), (64, 0.1)])
 def test_exact_on_lambertian_scenes_with_shadows(count, cast):
     lights, truth = cap_directions(count, 70, 3, even=True), cap_directions(300, 60, 4, even=True)
     observations = np.maximum(truth @ lights.T, 0)
@@ -88,14 +86,14 @@ def test_exact_on_lambertian_scenes_with_shadows(count, cast):
     # Fewer than four may be three in one plane.
     reached = (observations > 0).sum(axis=1) >= 4
     # Cast shadows are seldom quite black.
-    observations[np.random.default_rng(2).uniform(size=observations.shape) < cast] *= 0.05
+    observations[default_rng(2).uniform(size=observations.shape) < cast] *= 0.05
     assert angle_between_deg(estimate(observations, lights), truth)[reached].max() < 0.001
 
 
-@pytest.mark.parametrize("count, untouched", [(10, 8), (96, 60)])
+@parametrize("count, untouched", [(10, 8), (96, 60)])
 def test_noise_and_highlights_cost_less_than_in_least_squares(count, untouched):
     lights = cap_directions(count, 38, 3, even=True)
-    noise = np.random.default_rng(6).normal(1, 0.01, (len(TRUTH), count))
+    noise = default_rng(6).normal(1, 0.01, (len(TRUTH), count))
     observations = with_highlights(bipolynomial(TRUTH, lights) * noise, untouched)
     error = angle_between_deg(estimate(observations, lights), TRUTH).mean()
     assert (
@@ -104,7 +102,6 @@ def test_noise_and_highlights_cost_less_than_in_least_squares(count, untouched):
     )
 
 
-Array = Floats
 ON_CPU = MethodOptions(device="cpu")
 
 
@@ -118,7 +115,7 @@ def rendered(normals, lights, seed):
     """Diffuse and a Blinn-Phong highlight of random strength and width, with attached shadows;
     largest 1.
     """
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     strength, exponent = rng.uniform(0, 2, (len(normals), 1)), rng.uniform(5, 80, (len(normals), 1))
     shading = (normals @ lights.T).clip(0)
     observations = shading * (1 + strength * (normals @ halfway(lights).T).clip(0) ** exponent)
@@ -135,7 +132,7 @@ def test_lambertian_is_exact():
         truth = truth[(observations > 0).sum(axis=1) >= 4]
         observations = (truth @ lights.T).clip(0) * 7
         # What is left is float32 and, for lights nearly in a plane, the ridge.
-        found = make_estimator("ia14", ON_CPU).estimate(observations.astype(np.float32), lights)
+        found = make_estimator("ia14", ON_CPU).estimate(np.float32(observations), lights)
         assert np.median(angle_between_deg(found, truth)) < 1e-4
         assert angle_between_deg(found, truth).max() < 0.02
 
@@ -161,13 +158,13 @@ def objective_of(intensities, lights, prior_weight):
     return hessian, g.mean(axis=0), monotone, used
 
 
-@pytest.mark.parametrize("count", [10, 96])
-@pytest.mark.parametrize("kind", ["random", "rendered"])
+@parametrize("count", [10, 96])
+@parametrize("kind", "random rendered")
 def test_optimum_is_the_librarys(kind, count):
     lights = cap_directions(count, 60, 5, even=True)
     truth = cap_directions(100, 60, 6, even=True)
     if kind == "random":
-        observations = np.random.default_rng(7).uniform(size=(100, count))
+        observations = default_rng(7).uniform(size=(100, count))
         observations /= observations.max(axis=1, keepdims=True)
     else:
         observations = rendered(truth, lights, 7)
@@ -182,8 +179,8 @@ def test_optimum_is_the_librarys(kind, count):
         expected = quadprog.solve_qp(definite, np.zeros(13), constraints, bounds, 1)[0]
         c = np.cumsum(d / (2 * intensities[used].mean()), axis=0)
         found = np.concatenate((n, c.ravel()))
-        assert mean @ found == pytest.approx(1, rel=1e-12)
+        assert mean @ found == approx(1, rel=1e-12)
         assert (monotone @ found).min() > -1e-12
         optimum = expected @ hessian @ expected
-        assert found @ hessian @ found == pytest.approx(optimum, rel=1e-6, abs=1e-9)
+        assert found @ hessian @ found == approx(optimum, rel=1e-6, abs=1e-9)
         assert angle_between_deg(n[None], expected[None, :3]).item() < 0.01

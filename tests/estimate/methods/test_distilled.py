@@ -4,13 +4,14 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-import pytest
 import torch
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
+from pytest import approx
 
 from distributions import seeded
-from scenes import Teacher, cap_directions, shade, spiral_lights
+from scenes import Teacher, cap_directions, parametrize, refuses, shade, spiral_lights
 from splinecli.errors import UsageError
 from splinecli.estimate.methods.distilled import DistilledEstimator, Perceptron, distil, draw_sample
 from splinecli.estimate.methods.estimator import (
@@ -57,7 +58,7 @@ def log_median(degrees):
 def noisy(normals, degrees, seed=5):
     """Return normals turned by about so many degrees."""
     noise = (
-        np.random.default_rng(seed).normal(size=normals.shape)
+        default_rng(seed).normal(size=normals.shape)
         * math.radians(degrees)
         / math.sqrt(math.pi / 2)
     )
@@ -90,18 +91,18 @@ def test_it_follows_the_truth_through_the_noise_of_its_teacher():
     found = learn(teacher)
     assert found.has_confidence
     error = angle_between_deg(found.estimate(observations, LIGHTS), normals).mean()
-    assert angle_between_deg(teacher.normals, normals).mean() == pytest.approx(4, abs=0.1)
+    assert angle_between_deg(teacher.normals, normals).mean() == approx(4, abs=0.1)
     assert angle_between_deg(LeastSquares().estimate(observations, LIGHTS), normals).mean() > 4
     assert error < 4 / 2
     told = found.distillation
-    assert told.mean_deg == pytest.approx(4, abs=0.8)  # 200 pixels are held out
-    assert told.expected_deg == pytest.approx(4, abs=0.2)
-    assert told.held_out == pytest.approx(told.sample / 8, abs=1)
+    assert told.mean_deg == approx(4, abs=0.8)  # 200 pixels are held out
+    assert told.expected_deg == approx(4, abs=0.2)
+    assert told.held_out == approx(told.sample / 8, abs=1)
     assert teacher.asked == told.sample + found.n_unlike < 1800
     assert_allclose(np.linalg.norm(found.estimate(observations, LIGHTS), axis=1), 1, atol=1e-5)
 
 
-@pytest.mark.parametrize("followed", [True, False])
+@parametrize("followed", [True, False])
 def test_it_learns_a_capture_anew_whose_observations_changed(followed):
     """The teacher says something else of the new observations. If that is noise,
     the teacher stays.
@@ -123,7 +124,7 @@ def test_lamps_near_a_plane_of_bumps():
     """Lamps at two widths: their light turns by 25 degrees over the plane, which no single set of
     lights explains.
     """
-    rng = np.random.default_rng(8)
+    rng = default_rng(8)
     points = np.concatenate((rng.uniform(-1, 1, (8000, 2)), np.zeros((8000, 1))), axis=1)
     normals = cap_directions(8000, 40)[rng.permutation(8000)]
     towards = 4 * LIGHTS - points[:, None]
@@ -141,7 +142,7 @@ def test_lamps_near_a_plane_of_bumps():
     assert far > 1.5 * error_deg
 
 
-@pytest.mark.parametrize("near", [False, True])
+@parametrize("near", [False, True])
 def test_gradient_against_autograd(near):
     generator = seeded(3)
     normals, observations = glossy(300)
@@ -166,11 +167,11 @@ def test_gradient_against_autograd(near):
 def test_it_learns_where_its_teacher_is_unsure():
     normals = cap_directions(6000, 50)
     dull = np.arange(6000) % 2 == 0
-    observations = (shade(normals, LIGHTS) ** np.where(dull, 1, 2)[:, None]).astype(np.float32)
+    observations = np.float32(shade(normals, LIGHTS) ** np.where(dull, 1, 2)[:, None])
     errors = np.where(dull[:, None], log_median(1), log_median(12))
     found = learn(Remembering(observations, normals, errors))
     learned = confident_share(found.estimate_with_error(observations, LIGHTS)[1])
-    truth = confident_share(errors.astype(np.float32))
+    truth = confident_share(np.float32(errors))
     assert np.abs(learned[dull].mean() - truth[dull].mean()) < 0.1
     assert np.abs(learned[~dull].mean() - truth[~dull].mean()) < 0.1
 
@@ -181,8 +182,7 @@ def test_a_rare_kind_of_pixel_is_left_to_the_teacher():
     rare = np.arange(20_000) % 1000 == 3
     observations[rare] = observations[rare][:, ::-1] ** 4
     taught = np.where(rare[:, None], np.array((0.6, 0.0, 0.8)), normals)
-    teacher = sure(observations, taught)
-    found = learn(teacher)
+    found = learn(sure(observations, taught))
     angles = angle_between_deg(found.estimate(observations, LIGHTS), taught)
     assert (angles[rare] < 1e-3).mean() > 0.9
     assert found.n_unlike <= 0.01 * 20_000
@@ -216,7 +216,7 @@ def test_too_few_pixels():
     """The sample is half of the lit pixels at most: of 127, 63."""
     normals, observations = glossy(127)
     teacher = sure(observations, normals)
-    with pytest.raises(UsageError, match="127 pixels are lit, too few to distil the network"):
+    with refuses("127 pixels are lit, too few to distil the network", UsageError):
         learn(teacher)
 
 
@@ -232,16 +232,14 @@ def test_sizes_grow_with_the_capture():
 
 def clusters():
     """Return 5,000 features near the origin, 20 far away near (9, 0, 0), and one at (0, 30, 0)."""
-    generator = seeded(1)
-    points = torch.randn(5021, 3, generator=generator) * 0.3
+    points = torch.randn(5021, 3, generator=seeded(1)) * 0.3
     points[5000:, 0] += 9
     points[5020] = torch.tensor((0.0, 30.0, 0.0))
     return points
 
 
 def test_rare_kinds_are_in_the_sample():
-    sample = draw_sample(clusters(), 1200, seeded(0))
-    rows = sample.rows.tolist()
+    rows = draw_sample(clusters(), 1200, seeded(0)).rows.tolist()
     assert len(set(rows)) == len(rows)
     assert len(rows) == 1200
     assert set(range(5000, 5021)) <= set(rows)
@@ -259,8 +257,7 @@ def test_the_first_rows_are_an_even_sample():
 
 def test_rare_groups_and_strangers_are_unlike():
     points = clusters()
-    sample = draw_sample(points, 1200, seeded(0), rare_share=0.005)
-    unlike = sample.unlike(points)
+    unlike = draw_sample(points, 1200, seeded(0), rare_share=0.005).unlike(points)
     assert unlike[5020]
     assert unlike.float().mean() <= 0.005
     none_rare = draw_sample(points, 1200, seeded(0))

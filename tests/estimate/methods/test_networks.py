@@ -9,10 +9,22 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
+from numpy.random import default_rng
+from pytest import approx
 
-from scenes import directions_at, evaluate, read_json, shade, sphere, spiral_lights
+from scenes import (
+    directions_at,
+    evaluate,
+    on_sphere,
+    parametrize,
+    put,
+    read_json,
+    shade,
+    sphere,
+    spiral_lights,
+    vectors,
+)
 from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.estimate.methods.batched import NetworkEstimator, context_sample, rotations_of
 from splinecli.estimate.methods.estimator import CONFIDENT_DEG
@@ -28,10 +40,9 @@ from tiny_networks import random_network
 
 
 def pixels(count):
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     lights = rng.normal(size=(10, 3)) + np.array((0, 0, 3))
-    observations = rng.uniform(size=(count, 10)).astype(np.float32)
-    return observations, unit(lights)
+    return rng.uniform(size=(count, 10)).astype(np.float32), unit(lights)
 
 
 def estimator(network=None, **options):
@@ -64,10 +75,10 @@ def test_rotations_of_a_canonical_network():
 
 SEES = {"map_size": 16, "set_width": 16, "set_layers": 1, "error_head": True, "sees_capture": True}
 PAPER = {"size": "paper", "map_size": 8}
-QUARTER, MIRROR = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.diag((1.0, -1, 1))
+QUARTER, MIRROR = vectors("0 -1 0; 1 0 0; 0 0 1"), np.diag((1.0, -1, 1))
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "settings, turn, symmetric_from", [(PAPER, QUARTER, 4), ({}, MIRROR, 2), (SEES, MIRROR, 2)]
 )
 def test_rotations_make_a_network_symmetric(settings, turn, symmetric_from):
@@ -122,7 +133,7 @@ def test_a_black_background_says_nothing_of_the_object():
     observations, lights = pixels(200)
     network = estimator(random_network(**SEES))
     expected = network.estimate(observations, lights)
-    dark = np.random.default_rng(1).uniform(0, 1e-3, (800, 10)).astype(np.float32)
+    dark = default_rng(1).uniform(0, 1e-3, (800, 10)).astype(np.float32)
     with_background = np.concatenate((dark[:400], observations, dark[400:]))
     found = network.bind(lighting_at(with_background, lights), row(1000)).estimate(
         with_background, lights
@@ -148,8 +159,7 @@ def test_outline_pixels_darker_than_their_inner_neighbours_are_not_sampled():
     brightness[4, 2] = 1.25  # an inner neighbour of (5, 1), which has 0.87 times their mean
     assert 0.9375 in sampled(brightness, mask)
     # A mask without inner pixels, and one with few, are sampled as they are.
-    line = np.eye(14, dtype=np.bool_)
-    assert len(sampled(brightness, line)) == 14
+    assert len(sampled(brightness, np.eye(14, dtype=np.bool_))) == 14
     mask[5:] = False
     brightness[4] = 0.5
     assert len(sampled(brightness, mask)) == mask.sum()
@@ -213,7 +223,7 @@ PUBLISHED_DEG = 0.5
 and only some pixels are scored. Ours may be better: ST14 and IA14 have priors here that ten lights
 need."""
 
-OBJECTS = pytest.mark.parametrize("place, name", [(0, "ballPNG"), (1, "catPNG")])
+OBJECTS = parametrize("place, name", [(0, "ballPNG"), (1, "catPNG")])
 
 
 @OBJECTS
@@ -249,7 +259,7 @@ def mean_errors(folder, methods, protocol):
 
 def check(errors, table, place):
     ours = {method: own[place] for method, (own, _) in table.items()}
-    assert errors == pytest.approx(ours, abs=REPEATED_DEG)
+    assert errors == approx(ours, abs=REPEATED_DEG)
     for method, (_, published) in table.items():
         assert errors[method] < published[place] + PUBLISHED_DEG, method
     # Least squares must not pass as one of the robust methods.
@@ -265,17 +275,17 @@ def glossy_pixels(n_lights):
     """
     grid = np.linspace(-0.7, 0.7, 5)
     x, y = (axis.ravel() for axis in np.meshgrid(grid * 0.9, grid * 0.9))
-    normals = np.stack((x, y, np.sqrt(1 - x**2 - y**2)), axis=-1)
+    normals = on_sphere(x, y)
     radius = 0.8 * np.sqrt((np.arange(n_lights) + 0.5) / n_lights)
     lights = directions_at(2.4 * np.arange(n_lights), np.arcsin(radius))
     return (
         normals,
         lights,
-        (0.6 * shade(normals, lights, gloss=5 / 6, exponent=60)).astype(np.float32),
+        np.float32(0.6 * shade(normals, lights, gloss=5 / 6, exponent=60)),
     )
 
 
-@pytest.mark.parametrize("name", sorted(manifest()))
+@parametrize("name", sorted(manifest()))
 def test_file(name):
     entry = manifest()[name]
     content = (SHIPPED / entry["file"]).read_bytes()
@@ -284,7 +294,7 @@ def test_file(name):
     assert resolve_weights(name).sha256 == entry["sha256"]
 
 
-@pytest.mark.parametrize("n_lights", [8, 96])
+@parametrize("n_lights", [8, 96])
 def test_glossy_pixels_are_better_than_by_least_squares(n_lights):
     normals, lights, observations = glossy_pixels(n_lights)
     estimators = [
@@ -306,12 +316,12 @@ def test_confidence_on_generated_pixels():
     error_deg = angle_between_deg(normals.numpy(), truth.numpy())
     confidence = probability_within(error, CONFIDENT_DEG).numpy()
     for fifth in np.array_split(confidence.argsort(), 5):
-        assert (error_deg[fifth] <= CONFIDENT_DEG).mean() == pytest.approx(
+        assert (error_deg[fifth] <= CONFIDENT_DEG).mean() == approx(
             confidence[fifth].mean(), abs=0.06
         )
 
 
-@pytest.mark.parametrize("name", sorted(manifest()))
+@parametrize("name", sorted(manifest()))
 def test_stored_prediction(name, request):
     """The numbers of these very files; `pytest --update-golden` after new weights."""
     _, lights, observations = glossy_pixels(10)
@@ -321,6 +331,6 @@ def test_stored_prediction(name, request):
     stored = read_json(GOLDEN)
     if request.config.getoption("--update-golden"):
         stored[name] = np.round(estimated, 4).tolist()
-        GOLDEN.write_text(json.dumps(dict(sorted(stored.items()))) + "\n", "utf-8")
+        put(GOLDEN, json.dumps(dict(sorted(stored.items()))) + "\n")
     # Other processors add up in another order; four decimals are 0.006 degrees.
     assert angle_between_deg(estimated, unit(np.array(stored[name]))).max() < 0.05

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
-from scenes import FOUR_LIGHTS, spiral_lights
+from scenes import FOUR_LIGHTS, assert_unit, parametrize, refuses, spiral_lights, vectors
 from splinecli.errors import ModelError, UsageError
 from splinecli.estimate.methods import MethodOptions, make_estimator, method_names
 from splinecli.estimate.methods.estimator import LeastSquares
@@ -34,8 +34,8 @@ def weights(tmp_path):
 
 
 def test_every_method_says_what_it_is_and_estimates(weights, tmp_path):
-    truth = np.array([[0.0, 0.0, 1.0], [0.28, 0.0, 0.96], [0.0, -0.28, 0.96]])
-    observations = (truth @ FOUR_LIGHTS.T * 0.5).astype(np.float32)
+    truth = vectors("0 0 1; 0.28 0 0.96; 0 -0.28 0.96")
+    observations = np.float32(truth @ FOUR_LIGHTS.T * 0.5)
     alone = save_tiny(tmp_path / "alone.safetensors", interpolates=False)
     fingerprints = set()
     for name in method_names():
@@ -50,7 +50,7 @@ def test_every_method_says_what_it_is_and_estimates(weights, tmp_path):
         # Lambertian fit.
         normals = estimator.estimate(observations, FOUR_LIGHTS)
         assert normals.shape == (3, 3)
-        assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-5)
+        assert_unit(normals)
         assert_allclose(normals, truth, atol=0.01)
     assert len(fingerprints) == len(method_names())
 
@@ -78,13 +78,13 @@ def test_weights_of_the_other_network(weights, tmp_path):
             "'alone' are for CNN-PS; the method spline-net .* Use them with --method cnn-ps",
         ),
     ):
-        with pytest.raises(ModelError, match=message):
+        with refuses(message, ModelError):
             make_estimator(method, MethodOptions(weights=file))
 
 
-@pytest.mark.parametrize("options", [MethodOptions(rotations=0), MethodOptions(batch_size=0)])
+@parametrize("options", [MethodOptions(rotations=0), MethodOptions(batch_size=0)])
 def test_counts_from_one(options, weights):
-    with pytest.raises(UsageError, match="whole numbers from 1"):
+    with refuses("whole numbers from 1", UsageError):
         make_estimator("spline-net", replace(options, weights=weights))
 
 
@@ -102,9 +102,9 @@ def largest_difference_deg(a, b):
     return float(angle_between_deg(a, b).max())
 
 
-@pytest.mark.parametrize("name", method_names())
-@pytest.mark.parametrize("change", ["order of lights", "darker", "brighter", "batches", "turn"])
-def test_what_changes_nothing(name, change, glossy_pixels):
+@parametrize("name", method_names())
+@parametrize("change", ["order of lights", "darker", "brighter", "batches", "turn"])
+def test_what_changes_nothing(name, change, glossy_pixels, rng):
     """But for CNN-PS, normals turn with the lights. That is only symmetric as far as its ten
     rotations go.
     """
@@ -112,21 +112,21 @@ def test_what_changes_nothing(name, change, glossy_pixels):
     observations = observations[: 12 if name == "cnn-ps" else 60]  # which takes ten times as long
     order, turn = np.arange(len(lights)), np.eye(3)
     if change == "order of lights":
-        order = np.random.default_rng(0).permutation(len(lights))
+        order = rng.permutation(len(lights))
     elif change == "turn" and name != "cnn-ps":
         turn = _about_view_axis(0.7)
     factors = np.full((len(observations), 1), {"darker": 1e-3, "brighter": 1000.0}.get(change, 1.0))
     if name not in SEE_CAPTURE:
         # A factor for each pixel: albedo is unknown, so it may not matter either.
         factors *= np.linspace(0.5, 2, len(observations))[:, None]
-    before = make(name).estimate(observations.astype(np.float32), lights)
+    before = make(name).estimate(np.float32(observations), lights)
     changed = (observations * factors)[:, order].astype(np.float32)
     after = make(name, 7 if change == "batches" else None).estimate(changed, lights[order] @ turn)
     assert largest_difference_deg(before @ turn, after) < 0.05
 
 
-@pytest.mark.parametrize("name", method_names())
-@pytest.mark.parametrize("n_lights", [3, 4, 14])
+@parametrize("name", method_names())
+@parametrize("n_lights", [3, 4, 14])
 def test_odd_pixels_still_get_a_normal(name, n_lights, glossy_pixels):
     _, lights, observations = glossy_pixels
     odd = observations[:6, :n_lights].astype(np.float32)
@@ -136,11 +136,11 @@ def test_odd_pixels_still_get_a_normal(name, n_lights, glossy_pixels):
     odd[3] = np.where(np.arange(n_lights) < 2, odd[3] + 1, 0)
     odd[4] *= -1  # a dark frame may have been subtracted
     found = make(name).estimate(odd, lights[:n_lights])
-    assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
-    np.testing.assert_array_equal(found[0], (0, 0, 1))
+    assert_unit(found)
+    assert_array_equal(found[0], (0, 0, 1))
 
 
-@pytest.mark.parametrize("name", method_names())
+@parametrize("name", method_names())
 def test_a_pixel_may_have_lights_of_its_own(name, glossy_pixels):
     """Two pixels at a time, with shared lights, are the oracle for all pixels at once, with lights
     of their own.
@@ -167,9 +167,9 @@ def _about_view_axis(angle):
     return np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
 
 
-@pytest.mark.parametrize("count", [3, 4, 10, 96])
-def test_solves_the_normal_equations(count):
-    observations = np.random.default_rng(0).uniform(size=(50, count))
+@parametrize("count", [3, 4, 10, 96])
+def test_solves_the_normal_equations(count, rng):
+    observations = rng.uniform(size=(50, count))
     directions = spiral_lights(count)
     estimate = LeastSquares().estimate(observations, directions)
     expected = np.linalg.lstsq(directions, observations.T, rcond=None)[0].T

@@ -17,6 +17,7 @@ from torch import nn
 from torch.testing import assert_close
 
 from distributions import seeded
+from scenes import parametrize, refuses
 from splinecli.errors import ModelError
 from splinecli.estimate.networks.li_ne_net import PaperLINet, PaperNENet
 from splinecli.workshop.import_weights import import_official
@@ -197,7 +198,7 @@ def test_files_of_old_and_without_statistics(authors, imported, changed, tmp_pat
         )
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "of, changes, message",
     [
         (0, {"main.0.weight": None}, "has no 'main.0.weight'"),
@@ -236,7 +237,7 @@ def test_files_of_old_and_without_statistics(authors, imported, changed, tmp_pat
     ],
 )
 def test_tensors_that_do_not_fit(changed, of, changes, message):
-    with pytest.raises(ModelError, match=message):
+    with refuses(message, ModelError):
         import_official(*changed(changes, of))
 
 
@@ -268,11 +269,11 @@ def countless_tensors(path, new=True):
 OLD_TENSORS = partial(countless_tensors, new=False)
 
 
-@pytest.mark.parametrize("write", [deflated, countless_records, countless_tensors, OLD_TENSORS])
+@parametrize("write", [deflated, countless_records, countless_tensors, OLD_TENSORS])
 def test_checkpoints_that_expand_are_refused_unread(write, files, tmp_path, monkeypatch):
     write(tmp_path / "G.ckpt")
     monkeypatch.setattr(torch, "load", None)
-    with pytest.raises(ModelError, match=r"G\.ckpt: not a PyTorch checkpoint, or damaged") as error:
+    with refuses(r"G\.ckpt: not a PyTorch checkpoint, or damaged", ModelError) as error:
         import_official(tmp_path / "G.ckpt", files[1])
     assert type(error.value.__cause__) is ValueError
 
@@ -295,7 +296,7 @@ def test_files_that_are_no_checkpoints(files, tmp_path):
     contents += [b"PK\x03\x04" + b"\0" * 100, pickle.dumps({"weight": 1})]
     for content in contents:
         path.write_bytes(content)
-        with pytest.raises(ModelError, match="not a PyTorch checkpoint, or damaged"):
+        with refuses("not a PyTorch checkpoint, or damaged", ModelError):
             import_official(path, files[1])
     without_numbers = {"a": torch.zeros(3).to_sparse()}, {"a": torch.zeros(3, device="meta")}
     for value in (
@@ -307,21 +308,21 @@ def test_files_that_are_no_checkpoints(files, tmp_path):
         *without_numbers,
     ):
         torch.save(value, path)
-        with pytest.raises(ModelError, match="not a state dictionary"):
+        with refuses("not a state dictionary", ModelError):
             import_official(path, files[1])
     torch.save({"network": Bomb()}, path)
-    with pytest.raises(ModelError, match="not a PyTorch checkpoint"):
+    with refuses("not a PyTorch checkpoint", ModelError):
         import_official(path, files[1])
     assert not (tmp_path / "exploded").exists()
     for missing, reason in (
         (tmp_path / "none.ckpt", "the file does not exist"),
         (tmp_path, "found a folder"),
     ):
-        with pytest.raises(ModelError, match=reason):
+        with refuses(reason, ModelError):
             import_official(missing, files[1])
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "network, theirs, published",
     [(PaperLINet(), AuthorsLINet(), 8.40), (PaperNENet(2, 32), AuthorsNENet(), 2.65)],
 )

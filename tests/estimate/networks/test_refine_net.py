@@ -8,6 +8,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from distributions import seeded
+from scenes import parametrize
 from splinecli.estimate.fits.least_squares import alternating_signs
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.refine_net import (
@@ -58,8 +59,8 @@ def features_of(observations, lights, normals, error):
     return features.T.view(-1, *observations.shape[1:])
 
 
-@pytest.mark.parametrize("mirror", [False, True])
-@pytest.mark.parametrize("quarters", range(4))
+@parametrize("mirror", [False, True])
+@parametrize("quarters", range(4))
 def test_features_turn_with_the_image(quarters, mirror):
     generator = seeded(1)
     lights = normalize(
@@ -97,7 +98,7 @@ def test_features_turn_with_the_image(quarters, mirror):
     assert_close(turn_maps(found_normals, turn.back, vectors=((0, 1),)), normals)
 
 
-@pytest.mark.parametrize("twice", [False, True])
+@parametrize("twice", [False, True])
 def test_a_new_net_changes_nothing(twice):
     features, mask = random_maps(12, 15)
     features[:, :3] = normalize(features[:, :3], dim=1)
@@ -129,7 +130,7 @@ def test_a_second_net_reads_the_results_of_the_first():
     assert (found[0] - normals[..., :8, 8:]).abs().max() > 1e-3
 
 
-@pytest.mark.parametrize("twice", [False, True])
+@parametrize("twice", [False, True])
 def test_outside_of_the_mask_is_outside_of_the_image(twice):
     features, mask = random_maps(20, 24)
     wide = torch.nn.functional.pad(features, (COARSEST, 9, 2 * COARSEST, 3))
@@ -141,8 +142,8 @@ def test_outside_of_the_mask_is_outside_of_the_image(twice):
         assert_close(within[box], alone, atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize("twice", [False, True])
-@pytest.mark.parametrize("turned", [False, True])
+@parametrize("twice", [False, True])
+@parametrize("turned", [False, True])
 def test_nothing_beyond_the_reach_counts(turned, twice):
     """Along a strip that is as wide as two of the coarsest cells."""
     net = random_net(twice=twice).double()
@@ -242,13 +243,12 @@ def test_attention_and_mean_are_those_of_the_formulas():
         for head in range(4):
             part = slice(4 * head, 4 * head + 4)
             asked = layer.queries(queries)[pixel, part]
-            weights = torch.softmax(keys[:, part] @ asked / 2, dim=0)
-            heads.append(weights @ values[:, part])
+            heads.append(torch.softmax(keys[:, part] @ asked / 2, dim=0) @ values[:, part])
         seen = torch.cat((queries[pixel], *heads, layer.pooled(sample).mean(dim=0)))
         assert_close(found[pixel], tokens[pixel] + layer.join(seen), atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "larger", [{"widths": (48, 96, 144, 96)}, {"reads_blur": True}, {"layers": 1}], ids=str
 )
 def test_a_larger_net_begins_with_the_results_of_the_smaller_one(larger):

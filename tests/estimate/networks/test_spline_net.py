@@ -13,6 +13,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from distributions import seeded
+from scenes import parametrize
 from splinecli.estimate.fits.least_squares import fit_lambertian
 from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.estimate.networks.config import STARTING_FITS, NetworkConfig, fit_normals
@@ -62,8 +63,8 @@ def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(pixels)
     assert_close(dense[visible, 0], matte, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("settings", [{}, SET])
-@pytest.mark.parametrize("degrees", [90.0, 33.0, -171.5])
+@parametrize("settings", [{}, SET])
+@parametrize("degrees", [90.0, 33.0, -171.5])
 def test_compact_estimates_turn_with_the_lights(pixels, degrees, settings):
     observations, lights = pixels
     network = random_network(**settings).double()
@@ -77,7 +78,7 @@ def test_compact_estimates_turn_with_the_lights(pixels, degrees, settings):
     assert (here - normalize(fit, dim=1)).abs().max() > 0.01
 
 
-@pytest.mark.parametrize("settings", [{}, SET])
+@parametrize("settings", [{}, SET])
 def test_observations_that_are_not_valid_do_not_matter(pixels, settings):
     observations, lights = pixels
     network = random_network(**settings).double()
@@ -100,7 +101,7 @@ def test_a_mirrored_view_is_the_view_of_the_mirrored_lights(pixels):
     assert (mirrored - plain).abs().max() > 1e-4
 
 
-@pytest.mark.parametrize("mirror", [False, True])
+@parametrize("mirror", [False, True])
 def test_frames_there_and_back(pixels, mirror):
     observations, lights = pixels
     network = random_network().double()
@@ -129,7 +130,7 @@ def test_autocast_does_not_round_the_geometry(pixels):
         assert_close(coarse, network(observations, lights).normals, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("median_deg, shape", [(0.5, 1.0), (4.0, 2.5), (30.0, 0.7)])
+@parametrize("median_deg, shape", [(0.5, 1.0), (4.0, 2.5), (30.0, 0.7)])
 def test_a_log_logistic_distribution(median_deg, shape):
     error = torch.tensor(
         [[math.log(math.radians(median_deg)), math.log(shape)]], dtype=torch.float64
@@ -156,14 +157,15 @@ def test_it_changes_no_normal():
         normals, error = telling(observations, lights)
         assert torch.equal(plain(observations, lights).normals, normals)
         assert plain(observations, lights).error is None
-        assert (error.shape, error.dtype) == ((20, 2), torch.float32)
+        assert error.shape == (20, 2)
+        assert error.dtype == torch.float32
         # It is of the pixel, not of its place in the capture's frame.
         turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         turned = telling(observations, lights @ turn.T).error
     assert_close(turned, error, atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize("n_maps", [1, 300])
+@parametrize("n_maps", [1, 300])
 def test_few_products_give_the_features_of_the_convolutions(n_maps):
     encoder = MapEncoder(3, 24, 2, 16)
     for parameter in encoder.parameters():
@@ -189,7 +191,7 @@ def draw_pixels(count, lights):
     return observations / observations.amax(dim=1, keepdim=True), directions
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "iw12-all"])
+@parametrize("name", [name for name in NAMES if name != "iw12-all"])
 def test_they_are_the_methods_of_these_names(name):
     observations, directions = draw_pixels(20, 12)
     shared = directions[0]
@@ -200,7 +202,7 @@ def test_they_are_the_methods_of_these_names(name):
     assert_close(found, torch.from_numpy(expected).float(), atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@parametrize("name", NAMES)
 def test_each_pixel_has_its_own_lights_and_their_number(name):
     observations, directions = draw_pixels(9, 12)
     count = torch.tensor([12, 11, 10, 9, 8, 7, 6, 5, 4])

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.testing import assert_close
 
+from scenes import parametrize, put, refuses
 from splinecli.errors import ModelError
 from splinecli.estimate.networks import weights
 from splinecli.estimate.networks.config import NetworkConfig
@@ -33,7 +34,7 @@ def write_like_splinecli(path, network, tensors, **changes):
     save_file(tensors, path, metadata | {"tensors_sha256": tensors_sha256(tensors)} | changes)
 
 
-@pytest.mark.parametrize("settings", [{}, {"size": "paper", "map_size": 8}])
+@parametrize("settings", [{}, {"size": "paper", "map_size": 8}])
 def test_round_trip(tmp_path, settings):
     network = random_network(**settings)
     path = tmp_path / "tiny.safetensors"
@@ -68,11 +69,11 @@ def test_every_tensor_and_no_other(tmp_path):
     more, less = tensors | {"extra": torch.zeros(1)}, {name: tensors[name] for name in others}
     for changed in (more, less, tensors | {first: tensors[first][:-1].clone()}):
         write_like_splinecli(path, network, changed)
-        with pytest.raises(ModelError, match="do not fit the configuration"):
+        with refuses("do not fit the configuration", ModelError):
             load_weights(path)
 
 
-@pytest.mark.parametrize("config", ["", "{", "3", '["width"]', '{"width": -1}', '{"height": 3}'])
+@parametrize("config", ["", "{", "3", '["width"]', '{"width": -1}', '{"height": 3}'])
 def test_a_configuration_that_cannot_be(tmp_path, config):
     network = random_network()
     tensors = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
@@ -95,7 +96,7 @@ class TensorsMade(TorchFunctionMode):
         return result
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "settings",
     [
         {"width": 4096, "head_width": 4096, "map_size": 128},
@@ -111,7 +112,7 @@ def test_a_configuration_far_larger_than_the_tensors(tmp_path, settings):
     write_like_splinecli(path, network, dict(network.state_dict()), config=config)
     with (
         TensorsMade() as tensors,
-        pytest.raises(ModelError, match=r"do not fit the configuration|from 1 to 64"),
+        refuses(r"do not fit the configuration|from 1 to 64", ModelError),
     ):
         load_weights(path)
     assert max(tensors.made, default=0) < 1_000_000
@@ -127,10 +128,10 @@ def test_no_changed_byte_goes_unnoticed(saved):
     load_weights(saved)
 
 
-@pytest.mark.parametrize("content", [b"", b"not weights\n", b"\x00" * 64, None])
+@parametrize("content", [b"", b"not weights\n", b"\x00" * 64, None])
 def test_files_of_other_kinds(saved, content):
     saved.write_bytes(saved.read_bytes()[:-100] if content is None else content)
-    with pytest.raises(ModelError, match="not a safetensors file"):
+    with refuses("not a safetensors file", ModelError):
         load_weights(saved)
 
 
@@ -138,7 +139,7 @@ def test_somebody_else_s_safetensors(tmp_path):
     path = tmp_path / "other.safetensors"
     # bfloat16, which numpy does not know: the format is read before any tensor.
     save_file({"weight": torch.zeros(3, dtype=torch.bfloat16)}, path)
-    with pytest.raises(ModelError, match="found the format none, expected splinecli-weights-1"):
+    with refuses("found the format none, expected splinecli-weights-1", ModelError):
         load_weights(path)
 
 
@@ -153,24 +154,25 @@ def test_nothing_is_unpickled(tmp_path):
         lambda: torch.save({"w": torch.zeros(3)}, path),
     ):
         write()
-        with pytest.raises(ModelError, match="not a safetensors file"):
+        with refuses("not a safetensors file", ModelError):
             resolve_weights(str(path))
     assert not (tmp_path / "exploded").exists()
-    with pytest.raises(ModelError, match="found a folder"):
+    with refuses("found a folder", ModelError):
         resolve_weights(str(tmp_path))
 
 
 def test_shipped_weights_by_name(saved, monkeypatch):
     monkeypatch.setattr(weights, "SHIPPED", saved.parent)
     entry = {"file": saved.name, "sha256": hashlib.sha256(saved.read_bytes()).hexdigest()}
-    (saved.parent / "weights.json").write_text(
-        json.dumps({"good": entry, "bad": entry | {"sha256": "0" * 64}})
+    put(
+        saved.parent / "weights.json",
+        json.dumps({"good": entry, "bad": entry | {"sha256": "0" * 64}}),
     )
     assert resolve_weights("good").name == "good"
     assert resolve_weights(str(saved)).name == "tiny"
-    with pytest.raises(ModelError, match="the shipped weights 'bad' were modified"):
+    with refuses("the shipped weights 'bad' were modified", ModelError):
         resolve_weights("bad")
-    with pytest.raises(ModelError, match=r"expected one of bad, good, or a \.safetensors file"):
+    with refuses(r"expected one of bad, good, or a \.safetensors file", ModelError):
         resolve_weights("better")
 
 
@@ -179,7 +181,7 @@ def test_weights_that_are_not_finite(tmp_path):
     with torch.no_grad():
         network.ne_net.out.bias[0] = float("nan")  # type: ignore[operator]
     save_weights(network, tmp_path / "nan.safetensors")
-    with pytest.raises(ModelError, match="not finite"):
+    with refuses("not finite", ModelError):
         load_weights(tmp_path / "nan.safetensors")
 
 
@@ -187,9 +189,7 @@ def test_countless_empty_tensors_are_refused_unread(tmp_path):
     empty = {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]}
     header = json.dumps({str(number): empty for number in range(30_000)}).encode()
     (tmp_path / "a.safetensors").write_bytes(len(header).to_bytes(8, "little") + header)
-    with pytest.raises(
-        ModelError, match=r"not a safetensors file, or it is truncated \(the header has \d+ b"
-    ):
+    with refuses(r"not a safetensors file, or it is truncated \(the header has \d+ b", ModelError):
         load_weights(tmp_path / "a.safetensors")
 
 
@@ -199,7 +199,7 @@ def test_round_trip_of_a_configuration():
         assert NetworkConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "values, message",
     [
         ({"grid": "odd"}, "network setting 'grid' is 'odd'; expected 'even' or 'cnn-ps'"),
@@ -223,5 +223,5 @@ def test_round_trip_of_a_configuration():
     ],
 )
 def test_refused(values, message):
-    with pytest.raises(ModelError, match=message):
+    with refuses(message, ModelError):
         NetworkConfig.from_dict(values)

@@ -9,14 +9,23 @@ from typing import TypeVar
 import numpy as np
 import pytest
 import torch
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from torch.nn.functional import normalize, pad
 from torch.testing import assert_close
 
 from conftest import directions_at
 from distributions import seeded
-from scenes import evaluate, read_image, spiral_lights, write_image
-from splinecli.capture import Capture
+from scenes import (
+    as_capture,
+    assert_unit,
+    evaluate,
+    parametrize,
+    read_image,
+    spiral_lights,
+    vectors,
+    write_image,
+)
 from splinecli.estimate.fits.least_squares import alternating_signs
 from splinecli.estimate.inference import estimate_normals
 from splinecli.estimate.methods import make_estimator
@@ -56,7 +65,7 @@ def distant(observations, lights=LIGHTS):
 
 def refine(mask, tile, *, dark=None):
     """Return the normals before, and normals and errors after refinement of a random map."""
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     count = np.count_nonzero(mask)
     normals = unit(rng.normal((0, 0, 3), 1, (count, 3))).astype(np.float32)
     errors = rng.normal((-3, 1), 0.3, (count, 2)).astype(np.float32)
@@ -70,24 +79,24 @@ def refine(mask, tile, *, dark=None):
     return normals, refined, errors
 
 
-@pytest.mark.parametrize("shape", [(2 * REACH + 70, 40), (40, 2 * REACH + 70)])
-def test_tiles_change_nothing(shape):
+@parametrize("shape", [(2 * REACH + 70, 40), (40, 2 * REACH + 70)])
+def test_tiles_change_nothing(shape, rng):
     """Three tiles in a row or in a column. Seams of tiles on all sides:
     test_shipped_refinement.py.
     """
-    mask = np.random.default_rng(0).random(shape) < 0.95
+    mask = rng.random(shape) < 0.95
     mask[30:60, 10:30] = False
     _, normals, errors = refine(mask, 512)
     _, tiled, tiled_errors = refine(mask, REACH)
     assert_allclose(tiled, normals, atol=1e-4)
     assert_allclose(tiled_errors, errors, rtol=1e-4, atol=1e-3)
-    assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    assert_unit(normals)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (37, 1), (5, 6)])
+@parametrize("shape", [(1, 1), (1, 40), (37, 1), (5, 6)])
 def test_small_and_thin_masks(shape):
     before, normals, _ = refine(np.ones(shape, np.bool_), 512)
-    assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    assert_unit(normals)
     assert np.abs(normals - before).max() > 1e-3
 
 
@@ -100,16 +109,16 @@ def test_dark_pixels_stay():
 
 def test_a_turned_capture_gets_turned_normals():
     """The mean over four turns does not depend on how the camera was held."""
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     mask = rng.random((24, 32)) < 0.9
     normals = unit(rng.normal((0, 0, 3), 1, (*mask.shape, 3))).astype(np.float32)
     net = lively(RefineNet())
 
     def refined(turns):
         """Refine the map turned counterclockwise by quarters, and turn the result back."""
-        turn = np.round(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])) if turns else np.eye(3)
+        turn = np.round(vectors("0 -1 0; 1 0 0; 0 0 1")) if turns else np.eye(3)
         seen, lights = np.rot90(mask, turns), LIGHTS @ turn.T
-        found = (np.rot90(normals, turns)[seen] @ turn.T).astype(np.float32)
+        found = np.float32(np.rot90(normals, turns)[seen] @ turn.T)
         observations = (found @ lights.T).clip(0).astype(np.float32)
         errors = np.tile(np.float32((-3, 1)), (len(found), 1))
         NetworkRefiner(net, "float32").refine(
@@ -133,11 +142,9 @@ def estimator(*, refines):
 
 
 def test_the_pixelwise_method_leaves_the_refinement_out():
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     mask = np.ones((7, 8), np.bool_)
-    capture = Capture(
-        "c", rng.uniform(0.1, 1, (56, 6)).astype(np.float32), LIGHTS, tuple(range(6)), mask
-    )
+    capture = as_capture(rng.uniform(0.1, 1, (56, 6)), LIGHTS, mask)
     pixelwise, refined = (
         estimate_normals(capture, estimator(refines=refines)) for refines in (False, True)
     )
@@ -147,7 +154,7 @@ def test_the_pixelwise_method_leaves_the_refinement_out():
     assert np.abs(refined.confidence_map - pixelwise.confidence_map).max() > 1e-3
 
 
-@pytest.mark.parametrize("of_package", [False, True])
+@parametrize("of_package", [False, True])
 def test_scored_pixels_are_estimated_among_all(tmp_path, of_package):
     """Refinement and context need the whole capture: 50 pixels score as they do in the map of
     `infer`.
@@ -207,9 +214,7 @@ def restored(refined, features, mask):
     )
 
 
-@pytest.mark.parametrize(
-    "noise, least, most", [(0.005, 0.975, 0.985), (0.03, 0.9, 0.985), (0.4, -0.001, 0.01)]
-)
+@parametrize("noise, least, most", [(0.005, 0.975, 0.985), (0.03, 0.9, 0.985), (0.4, -0.001, 0.01)])
 def test_grooves_come_back_where_they_exceed_the_noise(noise, least, most):
     """All of x comes back. Its share of the unit vector is smaller by the cosine, because z is no
     detail.
@@ -226,8 +231,8 @@ def test_nothing_comes_back_that_least_squares_does_not_show():
     assert_close(restored(FLAT, features, EVERYWHERE), FLAT, atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize("creased", [False, True])
-@pytest.mark.parametrize("lights", [FEW_LIGHTS, FEW_LIGHTS[:6], SQUARE])
+@parametrize("creased", [False, True])
+@parametrize("lights", [FEW_LIGHTS, FEW_LIGHTS[:6], SQUARE])
 def test_noise_stays_removed(lights, creased):
     """Also beside a crease, which is detail that is not missing."""
     slope = torch.where(torch.arange(SIDE) < SIDE // 2, 0.4, -0.4).expand(SIDE, SIDE)

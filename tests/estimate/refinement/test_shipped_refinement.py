@@ -3,10 +3,10 @@ everywhere.
 """
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from pytest import approx
 
-from scenes import directions_at, halfway
-from splinecli.capture import Capture
+from scenes import as_capture, directions_at, halfway, parametrize, tilted
 from splinecli.estimate.inference import estimate_normals
 from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.estimate.refinement.refiner import MARGIN, TILE, NetworkRefiner
@@ -28,7 +28,7 @@ def scene(normals, albedo, *, noise, gloss=0.0, unmeasured=1.0):
 
     The lamps are `unmeasured` times as strong as the capture says.
     """
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     flat = normals.reshape(-1, 3)
     observations = np.broadcast_to(albedo, normals.shape[:2]).reshape(-1, 1) * (
         flat @ LIGHTS.T
@@ -36,14 +36,7 @@ def scene(normals, albedo, *, noise, gloss=0.0, unmeasured=1.0):
     observations = unmeasured * (observations + gloss * (flat @ halfway(LIGHTS).T).clip(0) ** 60)
     observations += noise * observations.max() * rng.normal(size=observations.shape)
     mask = np.ones(normals.shape[:2], np.bool_)
-    return Capture(
-        "scene",
-        observations.clip(0).astype(np.float32),
-        LIGHTS,
-        tuple(range(10)),
-        mask,
-        normals.astype(np.float32),
-    )
+    return as_capture(observations.clip(0), LIGHTS, mask, ground_truth=np.float32(normals))
 
 
 def refined_and_not(*surface, **faults):
@@ -59,7 +52,7 @@ def refined_and_not(*surface, **faults):
     return refined, estimate_normals(capture, make_estimator("spline-net-pixelwise"))
 
 
-@pytest.mark.parametrize("noise, most_tilted_deg", [(0.01, 0.3), (0.03, 0.75)])
+@parametrize("noise, most_tilted_deg", [(0.01, 0.3), (0.03, 0.75)])
 def test_a_noisy_plate_stays_as_flat_as_it_is(noise, most_tilted_deg):
     both, pixelwise = refined_and_not(PLATE, 0.5, noise=noise)
     for refined in both:
@@ -68,7 +61,7 @@ def test_a_noisy_plate_stays_as_flat_as_it_is(noise, most_tilted_deg):
         assert float(angle_between_deg(mean, PLATE[0, 0])) < most_tilted_deg
 
 
-@pytest.mark.parametrize("gloss", [0.0, 0.5])
+@parametrize("gloss", [0.0, 0.5])
 def test_a_checker_of_albedo_leaves_no_more_trace_than_before(gloss):
     bright = (ROWS // 8 + COLUMNS // 8) % 2 == 1
 
@@ -86,7 +79,7 @@ def test_a_checker_of_albedo_leaves_no_more_trace_than_before(gloss):
 def grooves(width):
     """Normals of grooves `width` pixels to either side, and their slopes of 17 degrees."""
     slope = np.where((COLUMNS // width) % 2 == 1, 0.3, -0.3)
-    return unit(np.stack((-slope, np.zeros_like(slope), np.ones_like(slope)), axis=-1)), slope
+    return tilted(-slope, 0 * slope), slope
 
 
 def depth(estimate, slope):
@@ -95,15 +88,15 @@ def depth(estimate, slope):
     return float(((found - found.mean()) / slope).mean())
 
 
-@pytest.mark.parametrize("width, gloss", [(1, 0.0), (1, 0.5), (4, 0.5)])
+@parametrize("width, gloss", [(1, 0.0), (1, 0.5), (4, 0.5)])
 def test_grooves_keep_their_depth(width, gloss):
     normals, slope = grooves(width)
     both, pixelwise = refined_and_not(normals, 0.5, noise=0.002, gloss=gloss)
     for refined in both:
-        assert depth(refined, slope) == pytest.approx(depth(pixelwise, slope), rel=0.1)
+        assert depth(refined, slope) == approx(depth(pixelwise, slope), rel=0.1)
 
 
-@pytest.mark.parametrize("width, noise", [(1, 0.02), (2, 0.002)])
+@parametrize("width, noise", [(1, 0.02), (2, 0.002)])
 def test_wrong_light_intensities_do_not_blur_grooves(width, noise):
     """They turn normals by many degrees, which says nothing about detail. The net alone takes most
     of it for noise.
@@ -113,10 +106,10 @@ def test_wrong_light_intensities_do_not_blur_grooves(width, noise):
     both, pixelwise = refined_and_not(normals, 0.5, noise=noise, unmeasured=stronger)
     assert pixelwise.errors.mean > 8
     for refined in both:
-        assert depth(refined, slope) == pytest.approx(depth(pixelwise, slope), rel=0.15)
+        assert depth(refined, slope) == approx(depth(pixelwise, slope), rel=0.15)
 
 
-@pytest.mark.parametrize("behind", [0.002, 0.3])
+@parametrize("behind", [0.002, 0.3])
 def test_a_background_changes_nothing_on_the_object(behind):
     """A sphere before a dark or a bright wall, without a mask. A mask would end at the rim of the
     sphere.
@@ -144,7 +137,7 @@ def test_seams_of_tiles_do_not_show():
     slopes = np.stack((np.sin(columns / 9), np.cos((rows + columns) / 13)), axis=-1)
     normals = unit(np.dstack((slopes, np.ones_like(slopes[..., :1]))))
     capture = scene(normals, np.where(columns % 40 < 20, 0.8, 0.2), noise=0.01, gloss=0.5)
-    noise = np.random.default_rng(1).normal(scale=0.05, size=(capture.n_pixels, 3))
+    noise = default_rng(1).normal(scale=0.05, size=(capture.n_pixels, 3))
     before = unit(normals.reshape(-1, 3) + noise).astype(np.float32)
     errors_before = np.tile(np.array((np.log(0.05), 1), np.float32), (capture.n_pixels, 1))
     network = make_estimator("spline-net", MethodOptions(precision="float32")).refiner.network

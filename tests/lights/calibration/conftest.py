@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scenes import Floats, spiral_lights
+from scenes import spiral_lights
 from splinecli.maths.normals import unit
 
 Render = Callable[..., NDArray[np.float32]]
 
 
 @pytest.fixture
-def render_ball() -> Render:
+def render_ball():
     """A mirror ball (H, W) before a gray wall, 3 x 3 samples a pixel: a lamp of 2 degrees, a dim
     room around it.
 
@@ -23,15 +23,15 @@ def render_ball() -> Render:
     """
 
     def render(
-        light: Floats,
-        x: float = 103.3,
-        y: float = 88.7,
-        radius: float = 61.4,
-        shape: tuple[int, int] = (180, 210),
-        lamp: float = 30.0,
+        light,
+        x=103.3,
+        y=88.7,
+        radius=61.4,
+        shape=(180, 210),
+        lamp=30.0,
         *,
-        near: bool = False,
-    ) -> NDArray[np.float32]:
+        near=False,
+    ):
         height, width = shape
         offsets = (np.arange(3) - 1) / 3
         rows = (np.arange(height)[:, None] + offsets).ravel()
@@ -48,13 +48,12 @@ def render_ball() -> Render:
             towards = unit(light - centre - radius * np.stack((nx, ny, nz), axis=-1))
         values = np.where((mirrored * towards).sum(axis=-1) > np.cos(np.radians(2)), lamp, room)
         values = np.where(inside, values, 0.15)
-        picture = values.reshape(height, 3, width, 3).mean(axis=(1, 3))
-        return np.asarray(picture, np.float32)
+        return np.asarray(values.reshape(height, 3, width, 3).mean(axis=(1, 3)), np.float32)
 
     return render
 
 
 @pytest.fixture
-def lights() -> Floats:
+def lights():
     """Seven lights (7, 3), 0 to 60 degrees from the view."""
     return spiral_lights(7, 60, 0)

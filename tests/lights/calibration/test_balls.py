@@ -1,16 +1,11 @@
 """From folders of photographs to the lights."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from numpy.typing import NDArray
 
-from lights.calibration.conftest import Render
-from scenes import decode_rgb, to_uint16, write_image
+from scenes import decode_rgb, parametrize, refuses, to_uint16, write_image
 from splinecli.capture import read_light_directions
-from splinecli.errors import InputError
 from splinecli.lights.calibration.balls import calibrate_ball, combine_balls, find_ball_files
 from splinecli.lights.calibration.circle import Circle
 from splinecli.maths.normals import angle_between_deg
@@ -19,24 +14,24 @@ from splinecli.pictures.plots import calibration_picture
 BALL = Circle(103.3, 88.7, 61.4)
 
 
-def write(folder: Path, name: str, picture: NDArray[np.floating]) -> Path:
+def write(folder, name, picture):
     folder.mkdir(exist_ok=True)
     write_image(folder / name, to_uint16(picture.clip(0, 1) * 65535))
     return folder
 
 
 @pytest.fixture
-def ball(tmp_path: Path, render_ball: Render, lights: NDArray[np.float64]) -> Path:
+def ball(tmp_path, render_ball, lights):
     """A folder with the ball under each light."""
     for number, light in enumerate(lights, start=1):
         write(tmp_path / "ball", f"{number}.png", render_ball(light, lamp=0.9))
     return tmp_path / "ball"
 
 
-@pytest.mark.parametrize("outline", ["--circle", "mask", "picture", "reference"])
+@parametrize("outline", "--circle mask picture reference")
 def test_lights_of_a_ball(ball, render_ball, lights, outline):
     if outline == "mask":
-        write(ball, "mask.png", BALL.inside((180, 210)).astype(np.float64))
+        write(ball, "mask.png", np.float64(BALL.inside((180, 210))))
     if outline == "reference":
         write(ball, "Ref.png", np.where(BALL.inside((180, 210)), 0.1, 0.9))
     files = find_ball_files(ball)
@@ -74,9 +69,7 @@ def test_several_balls_are_averaged(ball, tmp_path, render_ball, lights):
 def test_pictures_of_another_size(ball):
     write(ball, "3.png", np.zeros((50, 60)))
     for circle in (BALL, None):
-        with pytest.raises(
-            InputError, match=r"3\.png: found an image of 60 x 50 pixels, expected 210 x 180"
-        ):
+        with refuses(r"3\.png: found an image of 60 x 50 pixels, expected 210 x 180"):
             calibrate_ball(find_ball_files(ball), circle=circle)
 
 

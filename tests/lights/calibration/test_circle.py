@@ -1,21 +1,20 @@
 """Circles from masks and in pictures."""
 
 import numpy as np
-import pytest
 
+from scenes import parametrize, refuses
 from splinecli.capture import read_image, read_mask
-from splinecli.errors import InputError
 from splinecli.lights.calibration.circle import Circle, circle_from_mask, find_circles
 
 TRUE = Circle(103.3, 88.7, 61.4)
 
 
-def assert_close(found: Circle, true: Circle, pixels: float) -> None:
+def assert_close(found, true, pixels):
     differences = (found.x - true.x, found.y - true.y, found.radius - true.radius)
     assert max(map(abs, differences)) < pixels
 
 
-@pytest.mark.parametrize("with_stand", [False, True])
+@parametrize("with_stand", [False, True])
 def test_circle_of_a_mask(with_stand):
     """A stand and specks do not move the circle."""
     mask = TRUE.inside((180, 210))
@@ -36,19 +35,19 @@ def test_a_mask_cut_off_by_the_frame_keeps_its_circle():
 
 def test_masks_and_pictures_that_are_no_ball():
     for mask in (np.ones((50, 60), np.bool_), np.pad(np.ones((20, 120), np.bool_), 30)):
-        with pytest.raises(InputError, match="expected a ball"):
+        with refuses("expected a ball"):
             circle_from_mask(mask)
-    with pytest.raises(InputError, match="found no circle"):
+    with refuses("found no circle"):
         find_circles(np.tile(np.linspace(0, 1, 200), (150, 1)))
 
 
-@pytest.mark.parametrize(("ball", "wall"), [(0.1, 0.9), (0.9, 0.1), (0.01, 0.02)])
-@pytest.mark.parametrize("scale", [1, 6])
-def test_circle_in_a_picture(ball, wall, scale):
+@parametrize(("ball", "wall"), [(0.1, 0.9), (0.9, 0.1), (0.01, 0.02)])
+@parametrize("scale", [1, 6])
+def test_circle_in_a_picture(ball, wall, scale, rng):
     true = Circle(scale * TRUE.x, scale * TRUE.y, scale * TRUE.radius)
     shape = (180 * scale, 210 * scale)
     picture = np.where(true.inside(shape), ball, wall)
-    picture += np.random.default_rng(0).normal(0, 0.02 * abs(ball - wall), shape)
+    picture += rng.normal(0, 0.02 * abs(ball - wall), shape)
     found = find_circles(picture.clip(0))[0]
     assert_close(found, true, 0.5 * max(1, scale / 3))
     assert found.visible > 0.9

@@ -1,23 +1,21 @@
 """The camera of a calibration, from EXIF tags: focal lengths computed by hand."""
 
-from pathlib import Path
-
 import numpy as np
-import pytest
 from PIL import Image
 
+from scenes import parametrize, put
 from splinecli.capture.formats.facts import read_header
 from splinecli.lights.calibration.balls import DISTANT, find_view
 
 
-def photograph(path: Path, tags: dict[int, object]) -> Path:
+def photograph(path, tags):
     exif = Image.Exif()
     exif.get_ifd(0x8769).update(tags)
     Image.new("L", (360, 240)).save(path, exif=exif)
     return path
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("tags", "focal"),
     [
         ({0xA405: 50}, 500),  # 36 mm are 360 pixels
@@ -40,5 +38,5 @@ def test_focal_lengths(tmp_path, tags, focal):
 
 def test_a_file_comes_first(tmp_path):
     image = photograph(tmp_path / "a.jpg", {0xA405: 50})
-    (tmp_path / "m.txt").write_text("700 0 180\n0 710 120\n0 0 1\n")
+    put(tmp_path / "m.txt", "700 0 180\n0 710 120\n0 0 1\n")
     assert find_view(read_header(image), tmp_path / "m.txt").matrix[1, 1] == 710

@@ -5,11 +5,12 @@ gaps.
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
+from pytest import approx
 from torch.testing import assert_close
 
 from distributions import seeded
+from scenes import parametrize
 from splinecli.maths.observation_map import cell_directions
 from splinecli.workshop.pixel_sets.source import (
     FILL_ROUNDS,
@@ -36,7 +37,7 @@ def source_of(pixel_set, config=FAULTLESS, seed=0):
     return PixelSetSource(pixel_set, pixel_set.entries, config, seeded(seed))
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float16])
+@parametrize("dtype", [np.float32, np.float16])
 def test_without_faults_observations_are_the_stored_ones(make_set, dtype):
     pixel_set = make_set(dtype=dtype)
     batch = source_of(pixel_set).draw(200)
@@ -62,7 +63,7 @@ def test_without_faults_observations_are_the_stored_ones(make_set, dtype):
             assert distance[light] < 1e-6  # normalised once more
             used.add(light)
             expected = float(stored[name].observations[row, light]) * batch.exposure[pixel].item()
-            assert observed == pytest.approx(expected, rel=1e-6, abs=1e-9)
+            assert observed == approx(expected, rel=1e-6, abs=1e-9)
         assert len(used) == valid.sum()  # no light twice
         assert (batch.observations[pixel].numpy()[~valid] == 0).all()
     assert seen == {"a", "b", "c"}
@@ -74,8 +75,8 @@ def test_all_pixels_have_the_same_probability(make_set):
     of_b = (normals[:, None] == pixel_set.load(pixel_set.entries[1]).normals).all(axis=2)
     # 30 pixels of 90: a third, and a ninetieth each. Within four standard deviations of the
     # binomial.
-    assert of_b.any(axis=1).sum() == pytest.approx(3000, abs=4 * np.sqrt(9000 * 2 / 9))
-    assert of_b.sum(axis=0) == pytest.approx(np.full(30, 100), abs=4 * np.sqrt(100))
+    assert of_b.any(axis=1).sum() == approx(3000, abs=4 * np.sqrt(9000 * 2 / 9))
+    assert of_b.sum(axis=0) == approx(np.full(30, 100), abs=4 * np.sqrt(100))
 
 
 def test_a_set_with_fewer_lights_than_asked_for_gives_all_it_has(make_set):
@@ -116,7 +117,7 @@ def test_pixels_of_a_capture_are_of_one_entry_under_the_same_lights(make_set):
         assert {round(v, 4) for v in radiance[unclipped].tolist()} <= {round(v, 4) for v in stored}
     # An entry has as much weight as its pixels: 40, 30 and 20.
     shares = [entries.count(name) / len(entries) for name in "abc"]
-    assert shares == pytest.approx([4 / 9, 3 / 9, 2 / 9], abs=0.1)
+    assert shares == approx([4 / 9, 3 / 9, 2 / 9], abs=0.1)
 
 
 def analytic_scene(pixels=6):
@@ -128,7 +129,7 @@ def analytic_scene(pixels=6):
     return SampledPixels(normals, radiance, lights, torch.ones_like(radiance) > 0), normals
 
 
-@pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
+@parametrize("quarter_turns", [0, 1, 2, 3])
 def test_dense_truth_is_the_analytic_map_after_a_rotation(quarter_turns):
     scene, normals = analytic_scene()
     angle = torch.tensor(quarter_turns * torch.pi / 2).expand(6)
@@ -158,7 +159,7 @@ def test_gaps_are_filled_between_lights_and_not_beside_them():
     dense = fill_gaps(values, known, inside)
     # One gap is halfway between two lights. A single light fills none of its neighbours.
     assert dense.filled.sum() == 4
-    assert dense.values[0, 0, 16, 11].item() == pytest.approx(0.4)
+    assert dense.values[0, 0, 16, 11].item() == approx(0.4)
     assert torch.equal(dense.known, known)
 
 

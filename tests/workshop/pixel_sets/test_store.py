@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from kills import content, killed_at_every_step
-from scenes import read_json
+from scenes import names_in, parametrize, put, read_json, refuses
 from small_pixel_sets import matte_pixels
-from splinecli.errors import InputError, OutputError
+from splinecli.errors import OutputError
 from splinecli.system.publishing import held_folder
 from splinecli.workshop.pixel_sets.store import (
     ARRAYS,
@@ -28,7 +27,7 @@ def read_manifest(folder):
     return read_json(folder / MANIFEST)
 
 
-@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+@parametrize("dtype", [np.float16, np.float32])
 def test_round_trip(tmp_path, dtype):
     folder = tmp_path / "new" / "set"
     writer = PixelSetWriter(folder)
@@ -55,7 +54,7 @@ def test_round_trip(tmp_path, dtype):
     assert manifest["format"] == FORMAT
     assert [entry["recipe"] for entry in manifest["entries"]] == [RECIPE, RECIPE]
     assert (manifest["n_pixels"], manifest["complete"]) == (14, True)
-    assert sorted(path.name for path in folder.iterdir()) == ["a", "b", MANIFEST]
+    assert names_in(folder) == {"a", "b", MANIFEST}
 
 
 def test_continuing_keeps_existing_entries(tmp_path):
@@ -70,7 +69,7 @@ def test_continuing_keeps_existing_entries(tmp_path):
     more = PixelSetWriter(tmp_path)
     assert len(open_pixel_set(tmp_path).entries) == 2
     more.add("c", "c", "a test", RECIPE, matte_pixels(3, 5))
-    with pytest.raises(InputError, match="not finished"):
+    with refuses("not finished"):
         open_pixel_set(tmp_path)
     assert len(more.finish().entries) == 3
 
@@ -101,27 +100,28 @@ def test_a_replacement_killed_at_any_step_leaves_the_old_set_or_an_unfinished_on
         if kept[-1] == RECIPE:
             assert [entry.n_pixels for entry in open_pixel_set(folder).entries] == [7]
         else:
-            with pytest.raises(InputError, match="not finished"):
+            with refuses("not finished"):
                 open_pixel_set(folder)
             if kept[-1] is None:  # while its files changed, the set did not have the entry
                 replace(folder)
                 again = PixelSetWriter(folder)
             (entry,) = again.finish().entries
-            assert (entry.n_pixels, entry.recipe) == (9, {"seed": 2})
+            assert entry.n_pixels == 9
+            assert entry.recipe == {"seed": 2}
             assert open_pixel_set(folder).entries == (entry,)
     assert all(recipe in kept for recipe in (RECIPE, None, {"seed": 2}))
 
 
 def test_a_folder_with_other_files_is_left_alone(tmp_path):
-    (tmp_path / "thesis.tex").write_text("\\begin")
-    with pytest.raises(OutputError, match="has files in it but is not a pixel set"):
+    put(tmp_path / "thesis.tex", "\\begin")
+    with refuses("has files in it but is not a pixel set", OutputError):
         PixelSetWriter(tmp_path)
     assert content(tmp_path) == {"thesis.tex": b"\\begin"}
-    with pytest.raises(OutputError, match="found a file, expected a folder"):
+    with refuses("found a file, expected a folder", OutputError):
         PixelSetWriter(tmp_path / "thesis.tex")
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "manifest, message",
     [
         ({"name": "an app"}, "not the manifest of a pixel set: found format None"),
@@ -133,33 +133,33 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path):
 )
 def test_other_and_damaged_manifests_are_left_alone(tmp_path, manifest, message):
     text = json.dumps(manifest)
-    (tmp_path / MANIFEST).write_text(text)
-    with pytest.raises(InputError, match=message):
+    put(tmp_path / MANIFEST, text)
+    with refuses(message):
         PixelSetWriter(tmp_path)
     assert content(tmp_path) == {MANIFEST: text.encode()}
 
 
 def test_a_set_without_entries_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"manifest\.json: the pixel set has no entries"):
+    with refuses(r"manifest\.json: the pixel set has no entries"):
         PixelSetWriter(tmp_path / "empty").finish()
         open_pixel_set(tmp_path / "empty")
 
 
-@pytest.mark.parametrize("array", ARRAYS)
-@pytest.mark.parametrize("entry", ["a", "b"])
+@parametrize("array", ARRAYS)
+@parametrize("entry", "a b")
 def test_no_changed_byte_goes_unnoticed(make_set, array, entry):
     folder = make_set().folder
     path = folder / entry / f"{array}.npy"
     whole = path.read_bytes()
     for position in (8, 127, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :])
-        with pytest.raises(InputError, match="does not match the manifest") as caught:
+        with refuses("does not match the manifest") as caught:
             open_pixel_set(folder)
         assert caught.value.path == path
     path.write_bytes(whole)
     open_pixel_set(folder)
     path.unlink()
-    with pytest.raises(InputError, match=f"{entry}/{array}.npy: .*found no plain file"):
+    with refuses(f"{entry}/{array}.npy: .*found no plain file"):
         open_pixel_set(folder)
 
 
@@ -168,7 +168,7 @@ DAMAGED: dict[str, Any] = {
     "folder": Path.mkdir,
     "link to nothing": lambda path: path.symlink_to("nothing"),
     "empty": Path.touch,
-    "text": lambda path: path.write_text("no array"),
+    "text": lambda path: put(path, "no array"),
     "header": lambda path: path.write_bytes(b"\x93NUMPY\x01\x00\x10\x00{'descr': '<f4',"),
     "archive": lambda path: np.savez(path.with_suffix(".npz"), 1),
     "0-dimensional": lambda path: np.save(path, np.float32(1)),
@@ -180,8 +180,8 @@ DAMAGED: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("damage", DAMAGED)
-@pytest.mark.parametrize("array", ARRAYS)
+@parametrize("damage", DAMAGED)
+@parametrize("array", ARRAYS)
 def test_a_damaged_array_is_named(make_set, array, damage):
     """`prepare` loads the arrays of a set to draw its overview,
     without looking at the checksums.
@@ -190,12 +190,12 @@ def test_a_damaged_array_is_named(make_set, array, damage):
     path = pixel_set.folder / "a" / f"{array}.npy"
     path.unlink()
     DAMAGED[damage](path)
-    with pytest.raises(InputError, match="does not match the manifest") as caught:
+    with refuses("does not match the manifest") as caught:
         pixel_set.load(pixel_set.entries[0])
     assert caught.value.path == path
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "key, value, message",
     [
         (
@@ -231,12 +231,12 @@ def test_a_changed_manifest(make_set, key, value, message):
     folder = make_set().folder
     manifest = read_manifest(folder)
     manifest["entries"][0][key] = value
-    (folder / MANIFEST).write_text(json.dumps(manifest))
-    with pytest.raises(InputError, match=message):
+    put(folder / MANIFEST, json.dumps(manifest))
+    with refuses(message):
         open_pixel_set(folder)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "text, message",
     [
         ("{", "not JSON"),
@@ -250,7 +250,7 @@ def test_a_changed_manifest(make_set, key, value, message):
 )
 def test_no_manifest(make_set, text, message):
     folder = make_set().folder
-    (folder / MANIFEST).write_text(text)
-    with pytest.raises(InputError, match=message) as caught:
+    put(folder / MANIFEST, text)
+    with refuses(message) as caught:
         open_pixel_set(folder)
     assert caught.value.path == folder / MANIFEST

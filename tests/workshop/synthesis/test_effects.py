@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
+from pytest import approx
 from scipy import stats
 from torch.nn.functional import normalize
 from torch.testing import assert_close
@@ -31,10 +32,9 @@ from splinecli.workshop.synthesis.principled import PrincipledMaterial
 
 
 def test_walls_have_the_stated_shapes():
-    normals = draw_visible_normals(N, seeded(1))
-    wall = draw_wall(normals, 0.4, seeded())
+    wall = draw_wall(draw_visible_normals(N, seeded(1)), 0.4, seeded())
     present = wall.tan_height[:, 0] > 0
-    assert share(present) == pytest.approx(0.4, abs=SHARE)
+    assert share(present) == approx(0.4, abs=SHARE)
     assert_uniform(torch.rad2deg(wall.tan_height[present].atan()), 8, 75)
     assert_uniform(torch.rad2deg(wall.tan_half_width.atan()), 15, 88)
     assert_uniform(wall.softness, 0.01, 0.06)
@@ -46,7 +46,7 @@ def test_walls_have_the_stated_shapes():
     assert dot(wall.facing, wall.azimuth[:1])[0, 0] < 0
     assert ((wall.facing * wall.azimuth).sum(dim=1) < 0).all()
     assert not wall.reflectance[~present].any()
-    assert share(wall.has_pixel_material) == pytest.approx(0.5, abs=SHARE)
+    assert share(wall.has_pixel_material) == approx(0.5, abs=SHARE)
     # What reflects lies on the wall, on the side that faces the pixel.
     assert_close(wall.towards.norm(dim=1), torch.ones(N))
     along = (wall.towards * wall.azimuth).sum(dim=1)
@@ -105,7 +105,7 @@ def test_a_metal_wall_throws_its_highlight_where_the_metal_shows_it():
     facing, away = torch.tensor([[half, 0.0, half]]), torch.tensor([[0.2, 0.0, math.sqrt(0.96)]])
     lights = torch.tensor([mirrored, elsewhere])
     seen = wall.reflected(facing, mirror(1), lights)[0]
-    assert seen[0] == pytest.approx(9)  # both highlights are limited to three times a matte white
+    assert seen[0] == approx(9)  # both highlights are limited to three times a matte white
     assert seen[1] < 0.5
     assert wall.reflected(away, mirror(1), lights).max() < 0.5
 
@@ -135,7 +135,7 @@ def test_a_known_wall_hides_the_lights_behind_it():
 
 def test_ambient_light():
     ambient = draw_ambient(N, 0.3, seeded())
-    assert ambient.shape == (N, 1) and share(ambient > 0) == pytest.approx(0.3, abs=SHARE)
+    assert ambient.shape == (N, 1) and share(ambient > 0) == approx(0.3, abs=SHARE)
     assert_uniform(ambient[ambient > 0].log10(), -3.5, -1.3)
     assert not draw_ambient(N, 0.0, seeded()).any()
 
@@ -155,7 +155,7 @@ def test_errors_of_light_directions():
     # A pixel's angles have two components of its sigma each: sigma^2 is half of their mean square.
     sigma = np.sqrt((error**2).mean(axis=1) / 2)
     disturbed = sigma > 1e-6
-    assert disturbed.mean() == pytest.approx(0.6, abs=0.03)
+    assert disturbed.mean() == approx(0.6, abs=0.03)
     # Sigma itself is estimated from 80 numbers, to 8 per cent.
     assert stats.kstest(sigma[disturbed], lambda x: (x / 8).clip(0, 1) ** (1 / 3)).statistic < 0.04
     assert 6 < sigma.max() < 10
@@ -169,9 +169,9 @@ def test_errors_of_light_intensities():
     factor = (disturb_light_intensities(observations, 0.6, seeded()) / observations).numpy()
     sigma = np.sqrt(((factor - 1) ** 2).mean(axis=1))
     disturbed = sigma > 1e-5
-    assert disturbed.mean() == pytest.approx(0.6, abs=0.03)
+    assert disturbed.mean() == approx(0.6, abs=0.03)
     assert stats.kstest(sigma[disturbed], stats.uniform(0, 0.05).cdf).statistic < 0.04
-    assert factor[disturbed].mean() == pytest.approx(1, abs=1e-3)
+    assert factor[disturbed].mean() == approx(1, abs=1e-3)
     assert torch.equal(disturb_light_intensities(observations, 0.0, seeded()), observations)
 
 
@@ -179,15 +179,14 @@ def test_exposure():
     radiance = torch.rand(N, 5, generator=seeded(3)) * 30
     brightest = (radiance * draw_exposure(radiance, 0.25, seeded())).amax(dim=1)
     over = brightest > 1
-    assert share(over) == pytest.approx(0.25, abs=SHARE)
+    assert share(over) == approx(0.25, abs=SHARE)
     assert_uniform(brightest[over], 1, 3)
     dark = brightest < 10**-1.3
     # U(-2.7, -0.7) for 40 %: seven tenths of it lie below -1.3.
-    assert share(dark[~over]) == pytest.approx(0.4 * 0.7, abs=SHARE)
+    assert share(dark[~over]) == approx(0.4 * 0.7, abs=SHARE)
     assert_uniform(brightest[dark].log10(), -2.7, -1.3)
     assert brightest.min() >= 10**-2.7 * 0.999
-    unclipped = (radiance * draw_exposure(radiance, 0.0, seeded())).amax(dim=1)
-    assert unclipped.max() <= 1 + 1e-6
+    assert (radiance * draw_exposure(radiance, 0.0, seeded())).amax(dim=1).max() <= 1 + 1e-6
     assert torch.isfinite(draw_exposure(torch.zeros(3, 5), 0.5, seeded())).all()
 
 
@@ -200,9 +199,8 @@ def mean_square_of_power(low, high):
 def test_sensor_noise(level):
     noisy = add_sensor_noise(torch.full((N, 20), level), seeded())
     expected = mean_square_of_power(-4, -2.5) + level * mean_square_of_power(-3.5, -2)
-    variance = (noisy.double() - level).square().mean().item()
-    assert variance == pytest.approx(expected, rel=0.05)
-    assert noisy.double().mean().item() == pytest.approx(level, abs=1e-4)
+    assert (noisy.double() - level).square().mean().item() == approx(expected, rel=0.05)
+    assert noisy.double().mean().item() == approx(level, abs=1e-4)
 
 
 def is_multiple(values, steps):
@@ -218,19 +216,19 @@ def test_quantisation():
     ).double()
     of_srgb = (quantised[..., None] - decoded).abs().amin(dim=2).amax(dim=1) < 1e-6
     eight = is_multiple(quantised, 255)
-    assert share(of_srgb) == pytest.approx(0.15, abs=SHARE)
-    assert share(eight) == pytest.approx(0.15, abs=SHARE)
+    assert share(of_srgb) == approx(0.15, abs=SHARE)
+    assert share(eight) == approx(0.15, abs=SHARE)
     error = quantised - exposed
     # The high byte of 16 is up to a step of 255 too dark or, as 256 steps become 255, a little too
     # bright.
     cut = eight & (error.abs().amax(dim=1) > 0.5001 / 255)
     assert 0.06 < share(cut) <= 0.075 + SHARE
-    assert (error[cut].mean() * 255).item() == pytest.approx(0, abs=0.02)
+    assert (error[cut].mean() * 255).item() == approx(0, abs=0.02)
     assert error[eight & ~cut].abs().max().item() <= 0.5001 / 255
     for bits in (10, 12, 14, 16):
         other = is_multiple(quantised, 2**bits - 1) & ~eight & ~of_srgb
-        assert share(other) == pytest.approx(0.7 / 4, abs=SHARE)
-        assert error[other].abs().max().item() == pytest.approx(0.5 / (2**bits - 1), rel=0.01)
+        assert share(other) == approx(0.7 / 4, abs=SHARE)
+        assert error[other].abs().max().item() == approx(0.5 / (2**bits - 1), rel=0.01)
     assert (quantise(exposed, 0.0, seeded()) - exposed).abs().max() <= 0.5 / 1023 + 1e-9
 
 
@@ -238,7 +236,7 @@ def test_light_intensities():
     intensities = draw_light_intensities(N, 10, 0.4, seeded())
     assert intensities.amax(dim=1).sub(1).abs().max() == 0
     unequal = intensities.amin(dim=1) < 1
-    assert share(unequal) == pytest.approx(0.4, abs=SHARE)
+    assert share(unequal) == approx(0.4, abs=SHARE)
     # The largest of ten of 2^U(-2, 0) is 2^-0.18 on average, so all others are below the range's
     # upper end by that.
     assert intensities.min() >= 0.25
@@ -255,7 +253,7 @@ def test_restoring_half_of_the_clipped_pixels():
     stored = truth.clamp(max=1) * valid
     restored = restore(stored, clipped, lights, valid, seeded())
     changed = (restored != stored).any(dim=1)
-    assert share(changed) == pytest.approx(0.5, abs=0.08)
+    assert share(changed) == approx(0.5, abs=0.08)
     assert not (restored != stored)[~clipped].any()
     # Seven matte observations determine the others.
     known = changed & ((valid & ~clipped).sum(dim=1) >= 7)
@@ -264,8 +262,7 @@ def test_restoring_half_of_the_clipped_pixels():
 
 
 def draw_rigs(kind, pixels, lights):
-    random = seeded(0)
-    return draw_light_directions(pixels, lights, random, {kind: 1.0}).double().numpy()
+    return draw_light_directions(pixels, lights, seeded(0), {kind: 1.0}).double().numpy()
 
 
 def centred_rigs(kind, pixels, lights):
@@ -286,7 +283,7 @@ def test_half_of_the_draws_have_about_the_usual_number():
     # Four standard deviations of a share of 4000 are at most 0.03.
     for most in (7, 20, 50):
         expected = 0.5 * log_uniform(most) + 0.5 * (most >= 12)
-        assert (largest <= most).mean() == pytest.approx(expected, abs=0.035)
+        assert (largest <= most).mean() == approx(expected, abs=0.035)
     assert all(counts.min() >= np.floor(0.8 * counts.max()) for counts in draws)
 
 
@@ -294,7 +291,7 @@ def test_directions_are_unit_vectors_above_the_horizon():
     directions = draw_light_directions(2000, 30, seeded(0))
     assert directions.shape == (2000, 30, 3) and directions.norm(dim=-1).sub(1).abs().max() < 1e-6
     # Nothing lies outside 0.996 of the disc, where z = sqrt(1 - 0.996^2) = 0.0894.
-    assert directions[..., 2].min() == pytest.approx(0.0894, abs=1e-3)
+    assert directions[..., 2].min() == approx(0.0894, abs=1e-3)
 
 
 def test_rigs_are_ellipses_of_the_stated_axes():
@@ -307,7 +304,7 @@ def test_rigs_are_ellipses_of_the_stated_axes():
     largest_deg = np.degrees(np.arcsin(axes[small, 1]))
     assert largest_deg.min() > 18.5
     assert stats.kstest(largest_deg, stats.uniform(20, 20).cdf).pvalue > 1e-3
-    assert small.mean() == pytest.approx(20 / 68, abs=0.05)
+    assert small.mean() == approx(20 / 68, abs=0.05)
     assert (
         stats.kstest(axes[small, 0] / axes[small, 1], stats.uniform(0.5, 0.5).cdf).statistic < 0.07
     )
@@ -325,7 +322,7 @@ def test_rings_have_one_elevation():
     directions = draw_rigs("ring", 500, 200)
     polar_deg = np.degrees(np.arccos(directions[..., 2]))
     assert stats.kstest(polar_deg.mean(axis=1), stats.uniform(15, 60).cdf).statistic < 0.08
-    assert np.median(polar_deg.std(axis=1)) == pytest.approx(2, abs=0.15)
+    assert np.median(polar_deg.std(axis=1)) == approx(2, abs=0.15)
     # The mean direction of a whole ring is the view axis. An arc of A has sin(A / 2) / (A / 2) of a
     # ring's radius.
     off_axis = np.linalg.norm(directions[..., :2].mean(axis=1), axis=1) / np.sin(
@@ -346,7 +343,7 @@ def test_hand_held_lights_come_in_clusters():
     angles = np.degrees(np.arccos(np.clip(directions @ directions.transpose(0, 2, 1), -1, 1)))
     angles += 360 * np.eye(12)
     polar_deg = np.degrees(np.arccos(directions[..., 2]))
-    assert polar_deg.min() > 20 - 24 and np.median(polar_deg) == pytest.approx(45, abs=3)
+    assert polar_deg.min() > 20 - 24 and np.median(polar_deg) == approx(45, abs=3)
     # Three of four rigs have at least two lights a cluster, which are 6 sqrt(2) degrees apart on
     # average, or closer where a turn about the axis moves them less.
     assert (np.median(angles.min(axis=2), axis=1) < 12).mean() > 0.6

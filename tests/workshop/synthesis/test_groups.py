@@ -4,12 +4,14 @@ for.
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
+from scenes import assert_unit
 from splinecli.workshop.synthesis import groups, meshes
 from splinecli.workshop.synthesis.groups import draw_body, draw_group, draw_niche
 from splinecli.workshop.synthesis.meshes import REACH
 
-pytest.importorskip("skimage", reason="needs the extra 'render'")
+pytest.importorskip("skimage")
 
 
 @pytest.fixture(autouse=True)
@@ -26,9 +28,8 @@ def ball(radius):
     return mesh
 
 
-def test_a_leaning_ball_touches_where_it_stands():
+def test_a_leaning_ball_touches_where_it_stands(rng):
     first, second = ball(0.5), ball(0.5)
-    rng = np.random.default_rng(0)
     for _ in range(20):
         both = groups._leaning(first, second, rng, upward=(-0.5, 0.7), sizes=(0.4, 0.8))
         added = both.vertices[len(first.vertices) :]
@@ -43,12 +44,11 @@ def test_a_leaning_ball_touches_where_it_stands():
         )
 
 
-def test_facets_have_the_planes_they_are_drawn_from():
-    field = groups._draw_facets(np.random.default_rng(0), 0.5, 1.0)
+def test_facets_have_the_planes_they_are_drawn_from(rng):
+    field = groups._draw_facets(default_rng(0), 0.5, 1.0)
     mesh = meshes.triangulate(field, (1.1, 1.1, 1.1), 0.03)
     assert mesh is not None
     # A convex body lies below the tangent plane of each of its points, those on edges apart.
-    rng = np.random.default_rng(0)
     at, other = (rng.integers(len(mesh.vertices), size=4000) for _ in range(2))
     above = ((mesh.vertices[other] - mesh.vertices[at]) * mesh.vertex_normals[at]).sum(axis=1)
     assert np.quantile(above, 0.95) < 0.01
@@ -64,14 +64,14 @@ def edge_share(mesh):
 def test_sharper_grades_have_more_edges(monkeypatch):
     monkeypatch.setattr(groups, "SPACING", 0.025)  # otherwise, a fillet is within one face
     shares = [
-        [edge_share(draw_body(np.random.default_rng([1, n]), grade)) for n in range(4)]
+        [edge_share(draw_body(default_rng([1, n]), grade)) for n in range(4)]
         for grade in (0.0, 1.0)
     ]
     assert np.mean(shares[1]) > 3 * np.mean(shares[0])
 
 
 def test_a_niche_fills_the_frame_and_has_cavities():
-    mesh = draw_niche(np.random.default_rng(2), 0.5)
+    mesh = draw_niche(default_rng(2), 0.5)
     assert mesh is not None
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     assert (low[:2] < -1).all() and (high[:2] > 1).all()
@@ -81,10 +81,10 @@ def test_a_niche_fills_the_frame_and_has_cavities():
 def test_groups_are_of_every_kind_and_fit_the_frame():
     kinds = set()
     for n in range(12):
-        kind, mesh = draw_group(np.random.default_rng([3, n]), (), n / 12)
+        kind, mesh = draw_group(default_rng([3, n]), (), n / 12)
         kinds.add(kind)
         assert mesh.vertices.dtype == mesh.vertex_normals.dtype == np.float32
-        np.testing.assert_allclose(np.linalg.norm(mesh.vertex_normals, axis=1), 1, atol=1e-4)
+        assert_unit(mesh.vertex_normals, 1e-4)
         reach = np.abs(mesh.vertices[:, :2]).max()
         assert reach > REACH - 1e-3 if kind != "bowl" else reach == pytest.approx(REACH, abs=1e-4)
     assert kinds == {"bodies", "bowl", "niche"}

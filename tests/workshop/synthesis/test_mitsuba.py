@@ -10,8 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from scenes import vectors
+from splinecli.maths.normals import unit
 from splinecli.workshop.synthesis.meshes import (
-    Mesh,
     fit_to_frame,
     moved,
     smooth_cut,
@@ -22,7 +23,9 @@ from splinecli.workshop.synthesis.meshes import (
 )
 from splinecli.workshop.synthesis.scenes import SceneConfig, draw_scene, render_scene
 
-pytest.importorskip("embreex", reason="needs the extra 'render'")
+pytest.importorskip("embreex")
+from workshop.synthesis.test_rendering import mesh_of
+
 mitsuba = pytest.importorskip("mitsuba", reason="Mitsuba is the oracle")
 
 SIZE, SAMPLES = 32, 256
@@ -53,8 +56,7 @@ def bowl_with_ring():
         )
         return smooth_union(bowl, ring(points), 0.05)
 
-    mesh = triangulate(distance, (1.0, 1.0, 1.0), 0.03)
-    return fit_to_frame(mesh)
+    return fit_to_frame(triangulate(distance, (1.0, 1.0, 1.0), 0.03))
 
 
 @pytest.fixture(scope="module")
@@ -89,8 +91,7 @@ def block_means(values, mask):
         return pixels.reshape(SIZE // BLOCK, BLOCK, SIZE // BLOCK, BLOCK)
 
     inside = blocks(mask).all(axis=(1, 3))
-    means = blocks(image).mean(axis=(1, 3))[inside]
-    return means
+    return blocks(image).mean(axis=(1, 3))[inside]
 
 
 @pytest.mark.parametrize(
@@ -115,13 +116,9 @@ def test_images_agree(scene, rendered, benchmark, name, bounces, most_off):
 
 def corner():
     """Two plates that meet at a right angle in a valley along y, open to the camera."""
-    sides = [
-        [(-1, -1, 1), (0, -1, 0), (0, 1, 0), (-1, 1, 1)],
-        [(0, -1, 0), (1, -1, 1), (1, 1, 1), (0, 1, 0)],
-    ]
-    faces = [(0, 1, 2), (0, 2, 3), (4, 5, 6), (4, 6, 7)]
-    normals = np.array([(1, 0, 1)] * 4 + [(-1, 0, 1)] * 4, np.float32) / np.sqrt(np.float32(2))
-    mesh = Mesh(np.array(sides, np.float32).reshape(8, 3), np.array(faces, np.int32), normals)
+    left, right = "-1 -1 1; 0 -1 0; 0 1 0; -1 1 1", "0 -1 0; 1 -1 1; 1 1 1; 0 1 0"
+    normals = np.repeat(np.sqrt(0.5) * vectors("1 0 1; -1 0 1"), 4, axis=0)
+    mesh = mesh_of(f"{left}; {right}", "0 1 2; 0 2 3; 4 5 6; 4 6 7", normals)
     return split_long_edges(mesh, longest=0.03)
 
 
@@ -129,8 +126,8 @@ def test_glossy_plates_mirror_each_other_sharply(benchmark):
     """Most of the light of this metal was reflected twice. With blunt lobes, it is in the wrong
     places.
     """
-    lights = np.array([(0.3, 0.2, 0.9), (0.6, 0.1, 0.75), (0.05, -0.1, 1.0)], np.float32)
-    lights /= np.linalg.norm(lights, axis=1, keepdims=True)
+    lights = vectors("0.3 0.2 0.9; 0.6 0.1 0.75; 0.05 -0.1 1").astype(np.float32)
+    lights = unit(lights)
     drawn = benchmark.comparable(draw_scene(3, 0, CONFIG, corner()))
     zero = drawn.materials["metallic"].base[:1] * 0
     metal = replace(

@@ -3,12 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
+from pytest import approx
 from scipy import stats
 from torch.testing import assert_close
 
 from distributions import seeded
+from scenes import parametrize
 from splinecli.maths.observation_map import cell_directions
 from splinecli.workshop.synthesis.pixels import (
     PixelGenerator,
@@ -35,11 +36,10 @@ def test_batches_hold_what_a_capture_would():
     batch = draw(4000)
     pixels, lights = batch.observations.shape
     assert pixels == 4000
-    assert (batch.light_directions.shape, batch.exposure.shape) == (
-        (pixels, lights, 3),
-        (pixels, 1),
-    )
-    assert (batch.valid.shape, batch.valid.dtype) == ((pixels, lights), torch.bool)
+    assert batch.light_directions.shape == (pixels, lights, 3)
+    assert batch.exposure.shape == (pixels, 1)
+    assert batch.valid.shape == (pixels, lights)
+    assert batch.valid.dtype == torch.bool
     counts = batch.valid.sum(dim=1)
     assert counts.max() == lights <= 96
     # The numbers of one draw differ by a fifth.
@@ -53,7 +53,7 @@ def test_batches_hold_what_a_capture_would():
     assert (batch.observations.amax(dim=1) == 0).float().mean() < 0.02
 
 
-@pytest.mark.parametrize("config", [PixelGeneratorConfig(), PixelGeneratorConfig(mixed_share=1.0)])
+@parametrize("config", [PixelGeneratorConfig(), PixelGeneratorConfig(mixed_share=1.0)])
 def test_each_pixel_is_turned_by_its_own_angle(config):
     scene = draw_scene(100, config, seeded(0))
     angle = 2 * torch.pi * torch.rand(100, generator=seeded(1))
@@ -67,9 +67,7 @@ def test_each_pixel_is_turned_by_its_own_angle(config):
     assert_close(turned.radiance(turned_lights), scene.radiance(lights), rtol=2e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    "share", ["wall_share", "second_wall_share", "ambient_share", "mixed_share"]
-)
+@parametrize("share", "wall_share second_wall_share ambient_share mixed_share")
 def test_each_effect_shows_in_the_scene_and_can_be_switched_off(share):
     def dense(config):
         return draw_scene(400, config, seeded(0)).dense_truth().values
@@ -140,6 +138,6 @@ def test_a_capture_has_few_materials():
     base, roughness = (values.view(64, 2000).T for values in (material.base, material.roughness))
     counts = np.array([len(values.unique()) for values in base])
     assert counts.max() == 8
-    assert (counts == 1).mean() == pytest.approx(0.6, abs=4 * np.sqrt(0.24 / 2000))
+    assert (counts == 1).mean() == approx(0.6, abs=4 * np.sqrt(0.24 / 2000))
     one_gloss = np.array([len(values.unique()) == 1 for values in roughness])[counts > 1]
-    assert one_gloss.mean() == pytest.approx(0.5, abs=4 * np.sqrt(0.25 / len(one_gloss)))
+    assert one_gloss.mean() == approx(0.5, abs=4 * np.sqrt(0.25 / len(one_gloss)))

@@ -7,6 +7,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import torch
+from pytest import approx
 from scipy import integrate
 
 from distributions import seeded
@@ -142,8 +143,7 @@ def test_agrees_with_the_published_equations(surface):
 
 
 def test_float32_is_close_to_float64():
-    generator = seeded(0)
-    surface = draw_material(200, generator)
+    surface = draw_material(200, seeded(0))
     double = PrincipledMaterial(*(getattr(surface, name).double() for name in NAMES))
     lights = torch.from_numpy(hemisphere(100))
     normals = torch.from_numpy(hemisphere(200, seed=2)) + torch.tensor((0.0, 0.0, 0.2))
@@ -179,13 +179,13 @@ def test_drawn_materials_have_the_stated_classes():
         ((values["base"] < 0.05)[~metal], 0.5 * np.log10(0.05 / 10**-1.7) / 1.7),
     ):
         # four standard deviations
-        assert flags.mean() == pytest.approx(share, abs=4 * np.sqrt(0.25 / len(flags)))
+        assert flags.mean() == approx(share, abs=4 * np.sqrt(0.25 / len(flags)))
     assert (values["specular"][metal] <= 1).all() and values["base"][metal].min() >= 0.05
     assert not values["sheen"][metal].any() and not values["retro"][metal].any()
     rough = values["roughness"]
     assert 0.1 <= rough[metal | blend].min() < rough[metal | blend].max() <= 0.9
-    assert rough[~(metal | blend)].min() == pytest.approx(0.05, abs=0.01)
-    assert rough.max() == pytest.approx(1, abs=0.01)
+    assert rough[~(metal | blend)].min() == approx(0.05, abs=0.01)
+    assert rough.max() == approx(1, abs=0.01)
 
 
 def test_light_from_behind_what_is_seen_is_finite():

@@ -7,14 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
+from pytest import approx
 from torch import Tensor
 
-pytest.importorskip("embreex", reason="needs the extra 'render'")
+from scenes import on_sphere, parametrize, vectors
+
+pytest.importorskip("embreex")
 
 from numpy.testing import assert_allclose
 
 from distributions import seeded
 from point_lights import render_point_lights
+from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.workshop.synthesis import scenes as rendering
 from splinecli.workshop.synthesis.meshes import Mesh
 from splinecli.workshop.synthesis.ray_tracing import Tracer, find_visible_surface
@@ -70,9 +74,7 @@ def ball(radius, *, polar, inward, rings=120, sectors=240):
     # Anticlockwise from outside at +z, and from inside at -z: the same order of the azimuth either
     # way.
     faces = np.concatenate((np.stack((a, c, b), axis=1), np.stack((b, c, d), axis=1)))
-    return Mesh(
-        (radius * unit).astype(np.float32), faces.astype(np.int32), (sign * unit).astype(np.float32)
-    )
+    return Mesh(np.float32(radius * unit), faces.astype(np.int32), np.float32(sign * unit))
 
 
 def pixel_centres(view_mask):
@@ -82,9 +84,8 @@ def pixel_centres(view_mask):
     return np.stack(((columns + 0.5) * 2 / size - 1, 1 - (rows + 0.5) * 2 / size), axis=1)
 
 
-def directions(*vectors):
-    lights = np.array(vectors, np.float32)
-    return lights / np.linalg.norm(lights, axis=1, keepdims=True)
+def directions(text):
+    return np.float32(unit(vectors(text)))
 
 
 def direct_light(tracer, visible, lights, materials, patches=None):
@@ -94,9 +95,7 @@ def direct_light(tracer, visible, lights, materials, patches=None):
 
 
 def mesh_of(corners, faces, normals):
-    return Mesh(
-        np.array(corners, np.float32), np.array(faces, np.int32), np.array(normals, np.float32)
-    )
+    return Mesh(np.float32(vectors(corners)), vectors(faces).astype(np.int32), np.float32(normals))
 
 
 def test_a_matte_ball_is_lambert_s_law_and_lights_nothing_of_itself():
@@ -108,11 +107,11 @@ def test_a_matte_ball_is_lambert_s_law_and_lights_nothing_of_itself():
     # angle.
     assert visible.mask.sum() > 0.8 * np.pi * (0.45 * 64) ** 2
     x, y = (centres / 0.9).T
-    normals = np.stack((x, y, np.sqrt(np.maximum(1 - x * x - y * y, 0))), axis=1)
+    normals = on_sphere(x, y)
     well_inside = normals[:, 2] > 0.4
-    off = np.degrees(np.arccos(np.clip((normals * visible.normals).sum(axis=1), -1, 1)))
+    off = angle_between_deg(normals, visible.normals)
     assert off[well_inside].max() < 0.3
-    lights = directions((0, 0, 1), (0.5, 0.3, 0.8), (-0.7, 0.6, 0.2))
+    lights = directions("0 0 1; 0.5 0.3 0.8; -0.7 0.6 0.2")
     parts = (tracer, visible, lights, matte(0.7), np.zeros(len(tracer.mesh.faces), np.int64))
     direct = direct_light(tracer, visible, lights, matte(0.7))
     expected = 0.7 * np.maximum(normals @ lights.T, 0)
@@ -149,15 +148,14 @@ def test_a_ball_seen_from_a_finite_distance():
     assert 0.95 * outline < np.hypot(*centres.T).max() < outline
     # Where the ray from the camera through the middle of a pixel meets the ball
     rays = np.append(centres, np.zeros((len(centres), 1)), axis=1) - (0, 0, distance)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = unit(rays)
     along = -distance * rays[:, 2]
-    points = (0, 0, distance) + (along - np.sqrt(along**2 - distance**2 + radius**2))[
-        :, None
-    ] * rays
+    near = along - np.sqrt(along**2 - distance**2 + radius**2)
+    points = (0, 0, distance) + near[:, None] * rays
     inside = (points * rays).sum(axis=1) < -0.4 * radius
-    off = np.degrees(np.arccos(np.clip((points / radius * visible.normals).sum(axis=1), -1, 1)))
+    off = angle_between_deg(points / radius, visible.normals)
     assert off[inside].max() < 0.3
-    lights = directions((0, 0, 1), (0.3, 0.2, 0.9), (0, 0, 1), (-0.6, 0.1, 0.8))
+    lights = directions("0 0 1; 0.3 0.2 0.9; 0 0 1; -0.6 0.1 0.8")
     found = direct_light(tracer, visible, lights, {"cosines": Cosines()})
     expected = np.hstack(
         (np.tile(-(points / radius * rays).sum(axis=1)[:, None], 2), -rays @ lights[2:].T)
@@ -167,11 +165,9 @@ def test_a_ball_seen_from_a_finite_distance():
 
 def floor_with_wall():
     """The floor z = 0 and a thin wall of height 0.4 that stands on x = 0.2."""
-    corners = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]
-    corners += [(0.2, -1, 0), (0.2, 1, 0), (0.2, 1, 0.4), (0.2, -1, 0.4)]
-    faces = [(0, 1, 2), (0, 2, 3), (4, 6, 5), (4, 7, 6)]
+    floor, wall = "-1 -1 0; 1 -1 0; 1 1 0; -1 1 0", "0.2 -1 0; 0.2 1 0; 0.2 1 0.4; 0.2 -1 0.4"
     normals = [(0, 0, 1)] * 4 + [(-1, 0, 0)] * 4
-    return mesh_of(corners, faces, normals)
+    return mesh_of(f"{floor}; {wall}", "0 1 2; 0 2 3; 4 6 5; 4 7 6", normals)
 
 
 def test_a_wall_casts_its_shadow():
@@ -179,16 +175,14 @@ def test_a_wall_casts_its_shadow():
     visible = find_visible_surface(tracer, 50, 2)
     # At 45 degrees behind the wall the shadow is as long as the wall is high; from the front there
     # is none.
-    lights = directions((1, 0, 1), (-1, 0, 1))
-    direct = direct_light(tracer, visible, lights, matte(1.0))
+    direct = direct_light(tracer, visible, directions("1 0 1; -1 0 1"), matte(1.0))
     x = pixel_centres(visible.mask)[:, 0]
     in_shadow = (x > -0.2 + 0.04) & (x < 0.2 - 0.04)
     in_light = (x < -0.2 - 0.04) | (x > 0.2 + 0.04)
     assert np.abs(direct[in_shadow, 0]).max() == 0
     assert_allclose(direct[in_light, 0], np.sqrt(0.5), rtol=1e-5)
     beside = np.abs(x - 0.2) > 0.04
-    lit = direct[beside, 1]
-    assert_allclose(lit[x[beside] < 0.2], np.sqrt(0.5), rtol=1e-5)
+    assert_allclose(direct[beside, 1][x[beside] < 0.2], np.sqrt(0.5), rtol=1e-5)
     # Behind the wall, it is the other way round.
     behind = (x > 0.2 + 0.04) & (x < 0.6 - 0.04)
     assert np.abs(direct[behind, 1]).max() == 0
@@ -198,7 +192,7 @@ def test_a_point_of_light_follows_lamberts_law_and_the_wall_throws_its_shadow():
     """The cosine is h / d and the falloff (d0 / d)^2, so the radiance is albedo h d0^2 / d^3."""
     tracer = Tracer(floor_with_wall())
     visible = find_visible_surface(tracer, 50, 1)
-    lamps = np.array([(-2.0, 0.3, 1.0), (-0.8, 1.2, 3.0), (1.5, -0.4, 0.9)])
+    lamps = vectors("-2 0.3 1; -0.8 1.2 3; 1.5 -0.4 0.9")
     found = render_point_lights(tracer, visible, lamps, matte(0.7), np.zeros(4, np.int64))[
         "matte"
     ].numpy()
@@ -214,7 +208,7 @@ def test_a_point_of_light_follows_lamberts_law_and_the_wall_throws_its_shadow():
     assert 0.1 < clear[sure].mean() < 0.95
 
 
-@pytest.mark.parametrize("bounces", [1, 4])
+@parametrize("bounces", [1, 4])
 def test_light_between_the_walls_of_a_bowl(bounces):
     # From any point of a sphere every part of it of area dA has the form factor dA / (4 pi R^2). A
     # half sphere of reflectance rho, its mouth to the light: the flux pi R^2 falls in, rho of it is
@@ -222,7 +216,7 @@ def test_light_between_the_walls_of_a_bowl(bounces):
     rho, radius = 0.8, 0.9
     tracer = Tracer(ball(radius, polar=90, inward=True))
     visible = find_visible_surface(tracer, 24, 3)
-    lights = directions((0, 0, 1))
+    lights = directions("0 0 1")
     parts = (tracer, visible, lights, matte(rho), np.zeros(len(tracer.mesh.faces), np.int64))
     generator = seeded(0)
     indirect = render_indirect(*parts, directions=256, bounces=bounces, generator=generator)[
@@ -231,11 +225,11 @@ def test_light_between_the_walls_of_a_bowl(bounces):
     indirect /= visible.coverage
     again = rho / 2
     expected = rho * rho / 4 * (1 - again**bounces) / (1 - again)
-    assert indirect.mean() == pytest.approx(expected, rel=0.02)
+    assert indirect.mean() == approx(expected, rel=0.02)
     # The same at the bottom and near the rim.
     distance = np.hypot(*pixel_centres(visible.mask).T)
     for part in (distance < 0.4, distance > 0.65):
-        assert indirect[part].mean() == pytest.approx(expected, rel=0.05)
+        assert indirect[part].mean() == approx(expected, rel=0.05)
 
 
 def test_patches_have_their_own_material():
@@ -243,7 +237,7 @@ def test_patches_have_their_own_material():
     visible = find_visible_surface(tracer, 20, 2)
     materials = {"matte": Matte(torch.tensor([[0.25], [1.0]]))}
     patch_of_face = np.array([0, 1, 0, 0])  # the floor's triangles meet on its diagonal y = x
-    direct = direct_light(tracer, visible, directions((0, 0, 1)), materials, patch_of_face)[:, 0]
+    direct = direct_light(tracer, visible, directions("0 0 1"), materials, patch_of_face)[:, 0]
     x, y = pixel_centres(visible.mask).T
     below, above = y < x - 0.11, y > x + 0.11
     assert_allclose(direct[below], 0.25, rtol=1e-5)
@@ -251,15 +245,15 @@ def test_patches_have_their_own_material():
 
 
 def test_pixels_on_the_outline_are_as_bright_as_their_share_of_the_surface():
-    corners = [(-0.5, -0.5, 0), (0.7, -0.5, 0), (0.7, 0.5, 0), (-0.5, 0.5, 0)]
-    tracer = Tracer(mesh_of(corners, [(0, 1, 2), (0, 2, 3)], [(0, 0, 1)] * 4))
+    corners = "-0.5 -0.5 0; 0.7 -0.5 0; 0.7 0.5 0; -0.5 0.5 0"
+    tracer = Tracer(mesh_of(corners, "0 1 2; 0 2 3", [(0, 0, 1)] * 4))
     # Pixels are 0.2 wide. The edge at 0.7 leaves half of a column of pixels, which is 6 of 9
     # samples; the others are cut at their last third, or between pixels.
     visible = find_visible_surface(tracer, 10, 3)
-    direct = direct_light(tracer, visible, directions((0, 0, 1)), matte(1.0))
+    direct = direct_light(tracer, visible, directions("0 0 1"), matte(1.0))
     picture = np.zeros((10, 10))
     picture[visible.mask] = direct[:, 0]
     assert_allclose(picture[3:7, 3:8], 1, rtol=1e-6)
     assert visible.coverage.min() > 0.5
     assert_allclose(direct[:, 0], visible.coverage, rtol=1e-6)
-    assert picture.sum() == pytest.approx(1.2 / 0.04, rel=0.1)
+    assert picture.sum() == approx(1.2 / 0.04, rel=0.1)

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("embreex", reason="needs the extra 'render'")
+from scenes import assert_unit, vectors
+
+pytest.importorskip("embreex")
 
 from splinecli.maths.normals import unit
-from splinecli.workshop.synthesis.meshes import Mesh
 from splinecli.workshop.synthesis.scenes import (
     MATERIALS,
     MIN_LIGHT_Z,
@@ -15,21 +16,17 @@ from splinecli.workshop.synthesis.scenes import (
     draw_scene,
     render_scene,
 )
+from workshop.synthesis.test_rendering import mesh_of
 
 SMALL = SceneConfig(size=16, lights=24, samples=2, directions=8, bounces=2)
 
 
 def tent():
     """Two slopes that meet in a valley along y."""
-    corners = np.array(
-        [(-1, -1, 1), (0, -1, 0), (0, 1, 0), (-1, 1, 1), (1, -1, 1), (1, 1, 1)], np.float32
-    )
-    faces = np.array([(0, 1, 2), (0, 2, 3), (1, 4, 5), (1, 5, 2)], np.int32)
-    slope = np.sqrt(0.5)
-    normals = np.array(
-        [(slope, 0, slope), (0, 0, 1), (0, 0, 1), (slope, 0, slope)] + [(-slope, 0, slope)] * 2
-    )
-    return Mesh(corners, faces, normals.astype(np.float32))
+    corners = "-1 -1 1; 0 -1 0; 0 1 0; -1 1 1; 1 -1 1; 1 1 1"
+    left, right = np.sqrt(0.5) * vectors("1 0 1; -1 0 1")
+    up = (0, 0, 1)
+    return mesh_of(corners, "0 1 2; 0 2 3; 1 4 5; 1 5 2", [left, up, up, left, right, right])
 
 
 def test_a_scene_depends_on_its_seed_and_index_alone():
@@ -49,7 +46,8 @@ def test_what_is_rendered():
     assert pixels == 256  # the slopes fill the frame
     assert rendered.normals.shape == (pixels, 3)
     for observations in (rendered.observations[name] for name in MATERIALS):
-        assert (observations.shape, observations.dtype) == ((pixels, 24), np.float32)
+        assert observations.shape == (pixels, 24)
+        assert observations.dtype == np.float32
         assert np.isfinite(observations).all() and (observations >= 0).all()
     # The slopes light each other: without bounces the valley is darker, and nowhere brighter.
     direct = SceneConfig(**{**SMALL.__dict__, "bounces": 0})
@@ -60,9 +58,9 @@ def test_what_is_rendered():
         assert added.mean() > 0.01 * alone.observations[name].mean()
 
 
-def test_lights_cover_the_upper_hemisphere():
-    lights = draw_lights(500, np.random.default_rng(0))
-    np.testing.assert_allclose(np.linalg.norm(lights, axis=1), 1, atol=1e-5)
+def test_lights_cover_the_upper_hemisphere(rng):
+    lights = draw_lights(500, rng)
+    assert_unit(lights)
     assert (lights[:, 2] > MIN_LIGHT_Z).all()
     # Uniform by solid angle: z is uniform over 0..1, and every direction has a light within a few
     # mean distances.

@@ -6,12 +6,12 @@ import math
 
 import cv2
 import numpy as np
-import pytest
 import torch
+from pytest import approx
 from torch.testing import assert_close
 
 from distributions import seeded
-from scenes import spiral_lights
+from scenes import parametrize, spiral_lights
 from splinecli.workshop.synthesis.whole_capture import (
     Optics,
     _shadows,
@@ -30,7 +30,7 @@ def disc(size=40):
     return (rows - 20).square() + (columns - 20).square() < 12**2
 
 
-@pytest.mark.parametrize("seed", range(3))
+@parametrize("seed", range(3))
 def test_the_object_stays(seed):
     mask = disc()
     maps = torch.rand(9, 40, 40, generator=seeded(9)) + 0.2
@@ -62,7 +62,7 @@ def test_shadows_fall_away_from_the_light():
 SIZE = 48
 
 
-@pytest.mark.parametrize("seed", range(3))
+@parametrize("seed", range(3))
 def test_a_piece(seed):
     normals, radiance, mask = draw_engraved(SIZE, LIGHTS, seeded(seed))
     assert mask.shape == (SIZE, SIZE)
@@ -105,13 +105,13 @@ def spread(kernel):
     return float((kernel.sum(0) * places**2).sum().sqrt())
 
 
-@pytest.mark.parametrize("sigma", [0.6, 0.9, 1.2])
+@parametrize("sigma", [0.6, 0.9, 1.2])
 def test_kernels_have_the_width_that_they_state(sigma):
-    assert spread(gaussian_kernel(sigma)) == pytest.approx(sigma, rel=0.05)
+    assert spread(gaussian_kernel(sigma)) == approx(sigma, rel=0.05)
     # The mean over a pixel adds the variance of its own width, a twelfth.
-    assert spread(disc_kernel(sigma)) == pytest.approx(np.sqrt(sigma**2 + 1 / 12), rel=0.08)
+    assert spread(disc_kernel(sigma)) == approx(np.sqrt(sigma**2 + 1 / 12), rel=0.08)
     for kernel in (gaussian_kernel(sigma), disc_kernel(sigma)):
-        assert float(kernel.sum()) == pytest.approx(1)
+        assert float(kernel.sum()) == approx(1)
 
 
 def test_a_lens_spreads_a_point_into_its_kernel():
@@ -121,10 +121,10 @@ def test_a_lens_spreads_a_point_into_its_kernel():
     colours = camera(kernel.expand(3, -1, -1)).through_lens(image)
     reach = len(kernel) // 2
     assert_close(colours[1, 0, 5 - reach : 6 + reach, 5 - reach : 6 + reach], kernel)
-    assert float(colours[2].sum()) == pytest.approx(1)
+    assert float(colours[2].sum()) == approx(1)
 
 
-@pytest.mark.parametrize("code", [cv2.COLOR_BayerRGGB2RGB, cv2.COLOR_BayerRGGB2RGB_EA])
+@parametrize("code", [cv2.COLOR_BayerRGGB2RGB, cv2.COLOR_BayerRGGB2RGB_EA])
 def test_a_bayer_pattern_keeps_ramps_and_blurs_points(code):
     """Linear interpolation is exact on a ramp, whichever colours the ramp has. A point spreads."""
     ramp = (0.1 + 0.05 * torch.arange(12.0)).expand(1, 12, 12)
@@ -135,8 +135,8 @@ def test_a_bayer_pattern_keeps_ramps_and_blurs_points(code):
     point = torch.zeros(3, 1, 12, 12)
     point[:, 0, 6, 6] = 1  # a red cell: green and blue miss it
     seen = camera(demosaic=code).develop(point)
-    assert float(seen[0, 6, 6]) == pytest.approx(0.25, abs=1e-3)
-    assert float(seen[0, 6, 7]) == pytest.approx(0.125, abs=1e-3)
+    assert float(seen[0, 6, 6]) == approx(0.25, abs=1e-3)
+    assert float(seen[0, 6, 7]) == approx(0.125, abs=1e-3)
 
 
 def test_sharpening_raises_contrast_and_jpeg_keeps_flat_areas():
@@ -158,5 +158,4 @@ def test_light_that_scatters_stays_in_the_object():
     spread_out = scatter(radiance, mask, seeded(1))
     assert not spread_out[:, ~mask].any()
     assert spread_out[:, mask].std() < 0.9 * radiance[:, mask].std()
-    even = scatter(mask.float()[None], mask, seeded(1))
-    assert_close(even[0], mask.float())
+    assert_close(scatter(mask.float()[None], mask, seeded(1))[0], mask.float())

@@ -4,9 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
-
-from scenes import put
+from scenes import parametrize, put, refuses
 from splinecli.errors import ModelError, UsageError
 from splinecli.workshop import training
 from splinecli.workshop.options import parse_light_counts
@@ -23,13 +21,13 @@ from splinecli.workshop.training.config import (
 )
 
 
-@pytest.mark.parametrize("name", list(PRESETS))
+@parametrize("name", list(PRESETS))
 def test_round_trip_through_json(name):
     config = preset(name, seed=7, minutes=0.5)
     assert TrainingConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "values, message",
     [
         (
@@ -57,7 +55,7 @@ def test_round_trip_through_json(name):
     ],
 )
 def test_refused(values, message):
-    with pytest.raises(ModelError, match=message):
+    with refuses(message, ModelError):
         TrainingConfig.from_dict(values)
 
 
@@ -83,7 +81,7 @@ def test_presets_by_name():
     assert training.DEFAULT_PRESET in PRESETS
 
 
-@pytest.mark.parametrize("asked", [None, "compact"])
+@parametrize("asked", [None, "compact"])
 def test_a_toml_file_over_a_preset(tmp_path, asked):
     """A preset that is asked for by name comes before the file's."""
     text = (
@@ -99,23 +97,23 @@ def test_sources_are_replaced_as_a_whole(tmp_path):
     file = put(tmp_path / "a.toml", '[sources]\n"/data/a" = 2.0\n"/data/b" = 1.0\n')
     assert configure(None, file).sources == {"/data/a": 2.0, "/data/b": 1.0}
     assert configure(None, file, [{"sources": {"/data/c": 1.0}}]).sources == {"/data/c": 1.0}
-    with pytest.raises(ModelError, match="has no weight above 0"):
+    with refuses("has no weight above 0", ModelError):
         configure(None, None, [{"sources": {}}])
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "text, message",
     [("batch_size = 7", "is 7; expected a multiple of shards = 2"), ("steps = ", "is not TOML")],
 )
 def test_what_is_wrong_in_a_file_names_the_file(tmp_path, text, message):
     file = put(tmp_path / "a.toml", text)
-    with pytest.raises(ModelError, match=message) as caught:
+    with refuses(message, ModelError) as caught:
         configure(None, file, [{"seed": 1}])
     assert caught.value.path == file
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(ModelError, match="found a folder, expected a text file"):
+    with refuses("found a folder, expected a text file", ModelError):
         read_config_file(tmp_path)
     for name, content, message in (
         ("a.json", b"{", r"a\.json: is not JSON"),
@@ -124,11 +122,11 @@ def test_files_that_cannot_be_read(tmp_path):
         ("b.toml", b"preset = '\xff'", r"b\.toml: the file is not UTF-8 text"),
     ):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(ModelError, match=message):
+        with refuses(message, ModelError):
             read_config_file(tmp_path / name)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "text, expected",
     [
         ("seed=3", {"seed": 3}),
@@ -146,16 +144,16 @@ def test_parameters(text, expected):
     assert parse_parameter(text) == expected
 
 
-@pytest.mark.parametrize("text", ["seed", "=3", "a..b=1"])
+@parametrize("text", "seed =3 a..b=1")
 def test_bad_parameters(text):
-    with pytest.raises(UsageError, match=f"{text!r}; expected NAME=VALUE such as"):
+    with refuses(f"{text!r}; expected NAME=VALUE such as", UsageError):
         parse_parameter(text)
 
 
 def test_a_run_on_other_sources_is_refused(tmp_path):
     other = configure(changes=[{"sources": {"/data/set": 1.0}}], base=TrainingConfig())
-    with pytest.raises(
-        ModelError, match=r"the run was started with sources\./data/set = None, not 1\.0"
+    with refuses(
+        r"the run was started with sources\./data/set = None, not 1\.0", ModelError
     ) as caught:
         check_resumable(TrainingConfig(), other, tmp_path)
     assert caught.value.path == tmp_path
@@ -185,7 +183,7 @@ def test_the_home_folder_is_expanded_in_every_path(tmp_path, monkeypatch):
     assert config.start_from == str(tmp_path / "mine.safetensors")
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "text, expected",
     [("10", (10, 10, 10)), ("4-96", (4, 96, 10)), ("3-8", (3, 8, 8)), ("12-40", (12, 40, 12))],
 )
@@ -205,7 +203,7 @@ def test_removed_settings_of_earlier_versions(tmp_path):
     unused = put(tmp_path / "old.toml", "[pixels]\nmeasured_share = 0.0\nmeasured_materials = ''\n")
     assert configure("compact", unused) == preset("compact")
     used = put(tmp_path / "used.toml", "[pixels]\nmeasured_share = 0.5\n")
-    with pytest.raises(
-        ModelError, match=r"measured_share' is 0\.5, but training with measured materials was r"
+    with refuses(
+        r"measured_share' is 0\.5, but training with measured materials was r", ModelError
     ):
         configure("compact", used)

@@ -10,6 +10,7 @@ from dataclasses import replace
 import torch
 from torch.testing import assert_close
 
+from scenes import put
 from splinecli.estimate.networks.weights import load_weights
 from splinecli.workshop.training import METRICS, WEIGHTS
 from splinecli.workshop.training.loop import Trainer
@@ -58,7 +59,7 @@ def test_two_processes_compute_what_one_does(tiny, tmp_path):
     config = replace(tiny, symmetric_weight=0.02, asymmetric_weight=1e-4, ne_net_updates=2)
     configs = {"joint": config, "alternating": replace(config, updates="alternating")}
     text = json.dumps({name: values.to_dict() for name, values in configs.items()})
-    (tmp_path / "configs.json").write_text(text)
+    put(tmp_path / "configs.json", text)
     address = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": free_port()}
     processes = [
         subprocess.Popen(
@@ -113,7 +114,7 @@ run()
 def test_a_run_outlives_one_of_its_processes(tmp_path):
     # On the processor, one process of two is killed after the first checkpoint; torchrun starts
     # both again.
-    (tmp_path / "worker.py").write_text(FAILING)
+    put(tmp_path / "worker.py", FAILING)
     steps = 30
     settings = [
         "network.width=8",

@@ -8,10 +8,11 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
+from pytest import approx
 from torch.testing import assert_close
 
 from distributions import seeded
-from scenes import read_json
+from scenes import names_in, parametrize, read_json, refuses
 from splinecli.errors import ModelError
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import load_weights
@@ -44,7 +45,7 @@ class OneBatch(PixelGenerator):
 COSINE = TrainingConfig(learning_rate=1.5e-3, warmup_steps=300)
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "config, step, progress, expected",
     [
         (COSINE, 0, 0.0, 1.5e-3 / 300),
@@ -56,7 +57,7 @@ COSINE = TrainingConfig(learning_rate=1.5e-3, warmup_steps=300)
     ],
 )
 def test_schedules(config, step, progress, expected):
-    assert learning_rate(config, step, progress) == pytest.approx(expected)
+    assert learning_rate(config, step, progress) == approx(expected)
 
 
 def test_normals_of_one_batch_are_learnt_by_heart(tiny, tmp_path):
@@ -75,8 +76,13 @@ def losses(trainer, steps):
     return [trainer.step()[0].item() for _ in range(steps)]
 
 
-@pytest.mark.parametrize(
-    "updates, pixels", [("joint", "generator"), ("joint", "set"), ("alternating", "both")]
+@parametrize(
+    "updates, pixels",
+    """
+joint | generator
+joint | set
+alternating | both
+""",
 )
 def test_a_run_taken_up_goes_on_as_if_never_stopped(tiny, tmp_path, make_set, updates, pixels):
     sources = {"generator": {GENERATOR: 1.0}, "set": {}, "both": {GENERATOR: 1.0}}[pixels]
@@ -100,7 +106,7 @@ def test_a_run_taken_up_goes_on_as_if_never_stopped(tiny, tmp_path, make_set, up
     )
     assert second.counters == first.counters
     # The same operations on the same numbers; only their places in memory differ.
-    assert losses(second, 3) == pytest.approx(expected[3:], rel=1e-6)
+    assert losses(second, 3) == approx(expected[3:], rel=1e-6)
     for network in ("network", "average"):
         for name, tensor in getattr(whole, network).state_dict().items():
             assert_close(getattr(second, network).state_dict()[name], tensor, rtol=1e-5, atol=1e-7)
@@ -123,19 +129,17 @@ def test_a_run_begins_with_the_weights_it_is_given(tiny, tmp_path):
 
 def test_a_network_learns_to_see_the_capture_from_weights_that_do_not(tiny, tmp_path):
     alone = replace(tiny, network=replace(tiny.network, map_size=16, set_width=16, set_layers=1))
-    first = Trainer(alone, tmp_path / "first", CPU)
-    first.run()
+    Trainer(alone, tmp_path / "first", CPU).run()
     seeing = replace(
         alone,
         network=replace(alone.network, sees_capture=True),
         pixels=replace(alone.pixels, capture_pixels=8),
         start_from=str(tmp_path / "first" / WEIGHTS),
     )
-    second = Trainer(seeing, tmp_path / "second", CPU)
-    second.run()
+    Trainer(seeing, tmp_path / "second", CPU).run()
     contexts = load_weights(tmp_path / "second" / WEIGHTS).network.set_branch.contexts
     assert contexts is not None and contexts[0].join[2].weight.any()  # type: ignore[index]
-    with pytest.raises(ModelError, match="with sees_capture = True, the run's has False"):
+    with refuses("with sees_capture = True, the run's has False", ModelError):
         Trainer(
             replace(alone, start_from=str(tmp_path / "second" / WEIGHTS)), tmp_path / "third", CPU
         )
@@ -176,7 +180,7 @@ def test_only_the_error_head_learns_of_errors(tiny, tmp_path):
         first.state_dict()
     )
     for settings in ({"updates": "error_head"}, {"network": config.network}):
-        with pytest.raises(ModelError, match="the updates 'error_head' and 'refine_net' need"):
+        with refuses("the updates 'error_head' and 'refine_net' need", ModelError):
             replace(tiny, **settings)
 
 
@@ -186,12 +190,12 @@ def test_a_run_writes_its_files(tiny, tmp_path, monkeypatch):
     trainer = Trainer(replace(tiny, steps=10), tmp_path, CPU)
     last = trainer.run(lambda progress, metrics: seen.append((progress, metrics)))
     # And the pictures, which are not drawn here.
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
+    assert names_in(tmp_path) == {
         CHECKPOINT,
         "config.json",
         METRICS,
         WEIGHTS,
-    ]
+    }
     assert [(progress, metrics.step) for progress, metrics in seen] == [
         (0.4, 4),
         (0.8, 8),
@@ -207,8 +211,8 @@ def test_a_run_writes_its_files(tiny, tmp_path, monkeypatch):
     assert [row.validation_deg is not None for row in rows] == [False, False, True]
     loaded = load_weights(tmp_path / WEIGHTS).network
     again = trainer.task.validation_deg(loaded, bfloat16=False)
-    assert again == pytest.approx(last.validation_deg, abs=0.05)  # float16
-    assert rows[-1].loss == pytest.approx(last.loss, rel=1e-5)
+    assert again == approx(last.validation_deg, abs=0.05)  # float16
+    assert rows[-1].loss == approx(last.loss, rel=1e-5)
     assert TrainingConfig.from_dict(read_json(tmp_path / "config.json")) == trainer.config
 
 
@@ -221,9 +225,8 @@ def test_minutes_bound_a_run(tiny, tmp_path, monkeypatch):
     )
     trainer = Trainer(replace(tiny, steps=1, minutes=0.01), tmp_path, CPU)
     trainer.counters.seconds = 0.3
-    assert trainer.progress == pytest.approx(0.5)
-    last = trainer.run()
-    assert last.step > 1
+    assert trainer.progress == approx(0.5)
+    assert trainer.run().step > 1
     assert trainer.counters.seconds >= 0.6
 
 
@@ -242,7 +245,13 @@ def poison(trainer, what):
         parameter.register_hook(lambda gradient: gradient * math.inf)
 
 
-@pytest.mark.parametrize("what, updates", [("loss", "joint"), ("gradient", "alternating")])
+@parametrize(
+    "what, updates",
+    """
+loss | joint
+gradient | alternating
+""",
+)
 def test_what_is_not_finite_ends_the_run_before_it_does_harm(tiny, tmp_path, what, updates):
     trainer = Trainer(replace(tiny, updates=updates), tmp_path, CPU)
     losses(trainer, 2)
@@ -252,9 +261,7 @@ def test_what_is_not_finite_ends_the_run_before_it_does_harm(tiny, tmp_path, wha
         p.detach().clone() for p in (*trainer.network.parameters(), *trainer.average.parameters())
     ]
     poison(trainer, what)
-    with pytest.raises(
-        ModelError, match=rf"the {what} is (nan|inf) at step 2\. .*with a lower learning rate"
-    ):
+    with refuses(rf"the {what} is (nan|inf) at step 2\. .*with a lower learning rate", ModelError):
         trainer.run()
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == files
     after = (*trainer.network.parameters(), *trainer.average.parameters())
@@ -297,7 +304,7 @@ def test_validation_is_the_mean_angle_to_the_truth(tiny):
     with torch.no_grad():
         normals = network(batch.observations, batch.light_directions, batch.valid).normals
     errors_deg = (normals.double() * batch.truth.normals).sum(dim=1).clamp(-1, 1).acos().rad2deg()
-    assert found == pytest.approx(errors_deg.mean().item(), abs=1e-3)
+    assert found == approx(errors_deg.mean().item(), abs=1e-3)
 
 
 @pytest.fixture
@@ -312,23 +319,21 @@ def test_a_checkpoint_of_another_version_or_kind_is_refused(trainer, tmp_path):
     path = tmp_path / CHECKPOINT
     whole = path.read_bytes()
     save_weights(trainer.network, path)
-    with pytest.raises(ModelError, match="found the format splinecli-weights-1, expected"):
+    with refuses("found the format splinecli-weights-1, expected", ModelError):
         read_checkpoint_config(path)
     # The checksum does not cover the header. The new text has the same length, so that the header
     # stays valid.
     assert whole.count(b"batch_size") == 1
     path.write_bytes(whole.replace(b"batch_size", b"batch_sise"))
-    with pytest.raises(ModelError, match="unknown training setting 'batch_sise'"):
+    with refuses("unknown training setting 'batch_sise'", ModelError):
         read_checkpoint_config(path)
     renamed = whole.replace(b'\\"pixels\\": 16', b'\\"pixelz\\": 16')
     assert renamed != whole
     path.write_bytes(renamed)
-    with pytest.raises(
-        ModelError, match=r"the entry 'clock' in the file .* unknown field `pixelz`"
-    ):
+    with refuses(r"the entry 'clock' in the file .* unknown field `pixelz`", ModelError):
         Trainer(trainer.config, tmp_path, CPU, resume=True)
     path.write_bytes(
         whole.replace(b"batch_size", b"batch size").replace(b'\\"seed\\": 0', b'\\"seed\\"  0')
     )
-    with pytest.raises(ModelError, match="the entry 'config' in the file is not valid"):
+    with refuses("the entry 'config' in the file is not valid", ModelError):
         read_checkpoint_config(path)

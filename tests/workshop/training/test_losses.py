@@ -6,10 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from pytest import approx
 from scipy.ndimage import map_coordinates
 from torch.testing import assert_close
 
 from distributions import seeded
+from scenes import parametrize
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.maths.observation_map import cell_directions, sparse_map
@@ -44,12 +46,12 @@ def random_maps(*shape, seed=0):
 
 
 # A sine of 1e-6 stands in for zero, so that the gradient is bounded: 6e-5 degrees.
-@pytest.mark.parametrize("degrees", [0.0, 0.01, 10.0, 90.0, 179.0, 180.0])
+@parametrize("degrees", [0.0, 0.01, 10.0, 90.0, 179.0, 180.0])
 def test_angle(degrees):
-    assert math.degrees(angles(at(degrees), at(0)).item()) == pytest.approx(degrees, abs=6e-5)
+    assert math.degrees(angles(at(degrees), at(0)).item()) == approx(degrees, abs=6e-5)
 
 
-@pytest.mark.parametrize("norm, expected", [("mean", (0.4 + 0.3) / 2), ("sum", (1.6 + 0.6) / 2)])
+@parametrize("norm, expected", [("mean", (0.4 + 0.3) / 2), ("sum", (1.6 + 0.6) / 2)])
 def test_map_loss_is_over_the_known_cells_of_each_pixel(norm, expected):
     known = torch.zeros(2, 1, 4, 4, dtype=torch.float64)
     known[0, ..., 1:3, 1:3] = 1
@@ -59,12 +61,12 @@ def test_map_loss_is_over_the_known_cells_of_each_pixel(norm, expected):
     dense[0, 0, 1, 1] = truth[0, 0, 1, 1] - 0.7
     dense[0, 0, 0, 0] = dense[1, 0, 3, 3] = 1e6  # unknown
     # Three cells off by 0.3 and one by 0.7; two cells off by 0.3. Every pixel counts alike.
-    assert map_loss(dense, truth, known, norm).item() == pytest.approx(expected)
+    assert map_loss(dense, truth, known, norm).item() == approx(expected)
     assert map_loss(truth, truth, known, norm) == 0
     assert map_loss(dense, truth, torch.zeros_like(known), norm) == 0
 
 
-@pytest.mark.parametrize("azimuth_deg", [17, 90, 211])
+@parametrize("azimuth_deg", [17, 90, 211])
 def test_mirror_against_scipy(azimuth_deg):
     size = 16
     maps = random_maps(1, 1, size, size, seed=azimuth_deg)
@@ -80,7 +82,7 @@ def test_mirror_against_scipy(azimuth_deg):
     )
 
 
-@pytest.mark.parametrize("length", [0.0, 1e-9, AXIS_LENGTH / 2, AXIS_LENGTH, 1.0])
+@parametrize("length", [0.0, 1e-9, AXIS_LENGTH / 2, AXIS_LENGTH, 1.0])
 def test_gradients_in_the_normal_are_finite(length):
     normal = torch.tensor(
         [[length, 0.0, math.sqrt(1 - length**2)]], dtype=torch.float64, requires_grad=True
@@ -101,7 +103,7 @@ def four_cells(**cells):
 
 # The axis lies along x, so row 0 mirrors row 3 and row 1 row 2. The loss is for eta = 0.1 and
 # lambda_c = 2.
-@pytest.mark.parametrize(
+@parametrize(
     "maps, filled, fine, coarse, loss",
     [
         (four_cells(), 1.0, 0.0, 0.0, 0.1 + 2 * 0.1),
@@ -118,8 +120,8 @@ def four_cells(**cells):
 )
 def test_asymmetries_by_hand(maps, filled, fine, coarse, loss):
     found = asymmetries(maps, at(30, 0), torch.ones_like(maps) * filled)
-    assert [value.item() for value in found] == pytest.approx([fine, coarse], abs=1e-12)
-    assert asymmetric_loss(*found, eta=0.1, lambda_c=2.0).item() == pytest.approx(loss)
+    assert [value.item() for value in found] == approx([fine, coarse], abs=1e-12)
+    assert asymmetric_loss(*found, eta=0.1, lambda_c=2.0).item() == approx(loss)
 
 
 CPU = torch.device("cpu")
@@ -172,8 +174,14 @@ def test_the_angle_reaches_li_net_through_the_fixed_ne_net(tiny, network, batch)
     assert not moved(network.ne_net)
 
 
-@pytest.mark.parametrize("part", ["both", "ne_net", "li_net"])
-@pytest.mark.parametrize("li_net_norm, ne_net_norm", [("mean", "sum"), ("sum", "mean")])
+@parametrize("part", "both ne_net li_net")
+@parametrize(
+    "li_net_norm, ne_net_norm",
+    """
+mean | sum
+sum | mean
+""",
+)
 def test_the_total_is_the_weighted_sum_of_its_terms(
     tiny, network, batch, part, li_net_norm, ne_net_norm
 ):
@@ -214,7 +222,7 @@ def test_the_total_is_the_weighted_sum_of_its_terms(
                 both = fine.mean(), asymmetric_loss(fine, coarse, eta=2.0, lambda_c=10.0)
                 special[name] = share * torch.stack(both)
         symmetric, asymmetric = torch.stack(list(special.values())).sum(0)
-    assert found.angle.item() == pytest.approx(angle.item(), abs=1e-4)
+    assert found.angle.item() == approx(angle.item(), abs=1e-4)
     terms = (found.on_map, found.masked, found.symmetric, found.asymmetric)
     expected = ((on_map / cells).mean(), (masked / seen).mean(), symmetric, asymmetric)
     assert_close(terms, expected, rtol=1e-5, atol=0)
@@ -222,21 +230,21 @@ def test_the_total_is_the_weighted_sum_of_its_terms(
     if part != "ne_net":
         total += 0.5 * (on_map if li_net_norm == "sum" else on_map / cells).mean()
         total += 0.3 * (masked if li_net_norm == "sum" else masked / seen).mean()
-    assert found.total.item() == pytest.approx(total.item(), rel=1e-5)
+    assert found.total.item() == approx(total.item(), rel=1e-5)
 
 
 def test_a_degree_counts_more_on_a_capture_that_is_nearly_right():
     errors = torch.tensor([math.radians(1.0), math.radians(20.0)], requires_grad=True)
     (gradient,) = torch.autograd.grad(balanced(errors), errors)
-    assert (gradient[0] / gradient[1]).item() == pytest.approx(math.sqrt(22.5 / 3.5))
+    assert (gradient[0] / gradient[1]).item() == approx(math.sqrt(22.5 / 3.5))
     typical = torch.tensor([math.radians(2.5)] * 3)
-    assert balanced(typical).item() == pytest.approx(typical[0].item())
-    assert balanced(typical, torch.full((3,), math.radians(7.5))).item() == pytest.approx(
+    assert balanced(typical).item() == approx(typical[0].item())
+    assert balanced(typical, torch.full((3,), math.radians(7.5))).item() == approx(
         typical[0].item() / 2**0.5
     )
 
 
-@pytest.mark.parametrize("mirror", [False, True])
+@parametrize("mirror", [False, True])
 def test_truth_agrees_with_what_the_network_sees(tiny, mirror):
     # Without a camera's faults, the true dense map at a light in a cell's centre is the sparse map
     # there.

@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from scenes import decode_rgb
+from scenes import decode_rgb, names_in, parametrize
 from splinecli.records.output_files import CURVES, TRAINING_MAPS
 from splinecli.workshop.training import EVENTS, METRICS
 from splinecli.workshop.training.loop import Trainer
@@ -28,15 +28,14 @@ def log_of(folder, rows=ROWS, *, tensorboard=False):
 def test_metrics_round_trip(tmp_path):
     log_of(tmp_path)
     assert read_metrics(tmp_path / METRICS) == ROWS
-    text = (tmp_path / METRICS).read_text()
-    header, first, *_ = text.splitlines()
+    header, first, *_ = (tmp_path / METRICS).read_text().splitlines()
     assert header == ",".join(field.name for field in fields(Metrics))
     assert first == "50,800,0.1,0.001,2,20,0.2,0.1,,,"
     with (tmp_path / METRICS).open(newline="") as file:
         assert len(list(csv.reader(file))) == 4
 
 
-@pytest.mark.parametrize("step, kept", [(49, 0), (50, 1), (10**6, 3)])
+@parametrize("step, kept", [(49, 0), (50, 1), (10**6, 3)])
 def test_lines_of_a_later_step_are_dropped(tmp_path, step, kept):
     log_of(tmp_path)
     again = RunLog(tmp_path, step)
@@ -45,19 +44,18 @@ def test_lines_of_a_later_step_are_dropped(tmp_path, step, kept):
     assert read_metrics(tmp_path / METRICS) == [*ROWS[:kept], replace(ROWS[2], step=10**6 + 1)]
 
 
-@pytest.mark.parametrize("step", ["9" * 5000, "²"])
+@parametrize("step", ["9" * 5000, "²"])
 def test_a_last_line_that_no_parser_likes_is_dropped(tmp_path, step):
     log_of(tmp_path, ROWS[:2])
     with (tmp_path / METRICS).open("a", encoding="utf-8") as file:
         file.write(f"{step},1" + ",1.0" * 9 + "\n")
-    again = RunLog(tmp_path, 100)
-    assert again.set_aside is None
+    assert RunLog(tmp_path, 100).set_aside is None
     assert read_metrics(tmp_path / METRICS) == ROWS[:2]
 
 
 def test_pictures_of_a_run(tiny, tmp_path):
     Trainer(replace(tiny, steps=2), tmp_path, torch.device("cpu")).run()
-    assert {path.name for path in tmp_path.iterdir()} == {
+    assert names_in(tmp_path) == {
         "checkpoint.safetensors",
         "config.json",
         CURVES,

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from distributions import seeded
-from splinecli.errors import InputError
+from scenes import parametrize, refuses
 from splinecli.workshop.pixel_sets.store import Entry
 from splinecli.workshop.synthesis.pixels import PixelGenerator
 from splinecli.workshop.training.config import GENERATOR
@@ -39,7 +39,7 @@ def entries_of(*scenes):
     return [Entry(f"e{i}", scene, "", {}, 1, 3, {}) for i, scene in enumerate(scenes)]
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "scenes, share, n_validation",
     [
         (("a", "a", "b", "b", "c", "c"), 0.1, 1),
@@ -138,7 +138,7 @@ def test_a_validation_shape_of_one_set_is_not_trained_on_in_another(make_set, ti
     order = ("p", "q") if split_scenes(entries_of("p", "q"), 0.1)[1][0].scene == "p" else ("q", "p")
     rest = make_set("rest", entries=[(name, name, 20, 20) for name in order])
     alone = make_set("alone", entries=[("a", "a", 20, 20)])
-    with pytest.raises(InputError, match="all scenes of the set are used for validation"):
+    with refuses("all scenes of the set are used for validation"):
         open_sets(replace(tiny, sources={str(alone.folder): 1.0, str(rest.folder): 1.0}))
 
 
