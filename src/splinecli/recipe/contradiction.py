@@ -4,14 +4,15 @@ Under wrong lights the network expects larger errors, and its normals do not fit
 estimate/light_descent.py). A tilt, another frame, wrong elevations or another order of the lights
 are one fact to this witness: some steps of its descent show whether better lights are near. If so,
 lights are estimated from the images alone (lights/unknown_lights.py), and compared with the given
-ones. Faults of the values, such as near lamps, are less expensive for the network if the lights
-are wrong, too, so they raise the threshold.
+ones. If values are wrong, for example under near lamps, the cost also falls under other lights, so
+the threshold is higher where another warning doubts them.
 
 The thresholds were chosen on rendered captures (benchmarks/judgement.py). On draws of seven
 photographed objects, whose lights were measured, the cost falls by 0.4 at most.
 """
 
-from splinecli.judge.checks import WRITES_MENDED, Finding, Judgement, Remedy
+from splinecli.judge.checks import Finding, Judgement, Remedy
+from splinecli.judge.light_check import WRITES_MENDED
 from splinecli.lights.unknown_lights import find_lights
 from splinecli.maths.normals import angle_between_deg
 from splinecli.recipe.work import Work
