@@ -124,7 +124,7 @@ class LightWitness:
         that of the curl of its normals, weighted.
         """
         lights = torch.tensor(directions[self.used], dtype=torch.float32)
-        with torch.inference_mode(), one_thread_each():
+        with torch.no_grad(), one_thread_each():
             expected, curl, _ = self.images.judge(lights, lights.new_zeros(len(lights)))
         return _Followed(Lights(directions, directions), expected.item(), curl.item()).cost
 

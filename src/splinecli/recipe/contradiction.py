@@ -13,6 +13,7 @@ photographed objects, whose lights were measured, the cost falls by 0.4 at most.
 
 from splinecli.judge.checks import Finding, Judgement, Remedy
 from splinecli.judge.light_check import WRITES_MENDED
+from splinecli.lights.light_fit import refine_lights
 from splinecli.lights.unknown_lights import find_lights
 from splinecli.maths.normals import angle_between_deg
 from splinecli.recipe.work import Work
@@ -21,6 +22,7 @@ from splinecli.records.capture_warnings import (
     FAULTS_OF_LIGHTS,
     LIGHTS_CONTRADICTED,
     LIGHTS_UNCERTAIN,
+    ROUGH_LIGHTS,
     CaptureWarning,
 )
 
@@ -45,6 +47,12 @@ def ask_network(work: Work, judgement: Judgement) -> Judgement:
     values, given = capture.observations, capture.light_directions
     known = capture.estimated_intensities is None
     witness = LightWitness.of(values, capture.mask, given)
+    if any(each.kind is ROUGH_LIGHTS for each in judgement.warnings):
+        # A matte model also refines lights to fit gloss or fabric, which the network knows.
+        refined = refine_lights(values, given)
+        if refined is None or witness.cost(given) - witness.cost(refined.directions) < _UNCERTAIN:
+            kept = [each for each in judgement.warnings if each.kind is not ROUGH_LIGHTS]
+            judgement = judgement._replace(warnings=tuple(kept))
     fall, moved_deg = witness.descend(intensities_known=known)
     if fall < _DOUBT:
         return judgement
