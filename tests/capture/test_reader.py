@@ -3,7 +3,9 @@ what the record refuses; reading ahead.
 """
 
 import threading
+from contextlib import suppress
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
@@ -21,10 +23,12 @@ from scenes import (
 )
 from splinecli.capture import Capture, open_capture
 from splinecli.capture import source as module
+from splinecli.capture.formats.images import decode_image
 from splinecli.capture.source import read_ahead
 from splinecli.errors import UsageError
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.recipe import prepare_capture, read_capture
+from splinecli.system.machine import in_order
 
 INTENSITIES = vectors("1 2 4; 2 2 2; 0.5 1 3; 1 1 1")
 
@@ -266,6 +270,25 @@ def test_the_next_item_is_read_meanwhile(monkeypatch):
         assert begun[min(item + 1, 3)].wait(10)
         assert not any(event.is_set() for event in begun[item + 2 :])
     assert next(images, None) is None
+
+
+def test_only_the_damaged_one_of_files_that_are_decoded_at_once_is_refused(tmp_path):
+    """The messages of all decoders arrive in one place."""
+    content = bytearray(
+        cv2.imencode(".jpg", np.random.default_rng(1).integers(0, 255, (400, 400), np.uint8))[1]
+    )
+    right, damaged = (tmp_path / name for name in ("right.jpg", "damaged.jpg"))
+    right.write_bytes(content)
+    content[len(content) // 2 : len(content) // 2 + 2] = b"\xff\xd9"  # the end marker
+    damaged.write_bytes(content)
+
+    def refuses(path):
+        with suppress(InputError):
+            return decode_image(path) is None
+        return True
+
+    paths = [right, right, damaged, right, right, damaged] * 8
+    assert list(in_order(refuses, paths, threads=6)) == [path == damaged for path in paths]
 
 
 def test_messages_of_the_command_are_not_caught_with_those_of_the_libraries():

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from splinecli.capture.record import placeholders
 from splinecli.capture.source import Item, Progress, Source
 from splinecli.errors import InputError, UsageError
 from splinecli.images.saturation import check_white_level
-from splinecli.maths import Array, Bools, Float64Array, Integers
+from splinecli.maths import Array, Bools, Float32Array, Float64Array, Integers
 from splinecli.records.capture_warnings import CaptureWarning
 
 
@@ -65,9 +66,13 @@ class ArraySource(Source):
             used = stored[wanted]
             if around is not None:
                 used = np.concatenate((stored, take_around(pixels, around)))
-            linear = linearise.linear_light(used, path)
-            yield use(StoredPixels(path, stored, linear, self.light_intensities[index]))
+            light = partial(_light, used, path)
+            yield use(StoredPixels(path, stored, len(used), light, self.light_intensities[index]))
             progress()
+
+
+def _light(used: Array, path: Path, rows: Integers | slice) -> Float32Array:
+    return linearise.linear_light(used[rows], path)
 
 
 def open_arrays(

@@ -18,8 +18,9 @@ import numpy as np
 
 from splinecli.capture.formats.images import ExpectedSize, read_image
 from splinecli.capture.formats.numbers import read_number_rows
+from splinecli.capture.linearise import LightOf
 from splinecli.errors import InputError
-from splinecli.maths import Array, Float32Array, Float64Array
+from splinecli.maths import Array, Float32Array, Float64Array, Integers
 
 CROSSTALK = "crosstalk.txt"
 CHANNELS = 3
@@ -36,14 +37,14 @@ class ChannelLights:
     measured: bool  # whether it was read from a file
 
     def observe(
-        self, path: Path, stored: Array, linear: Float32Array, index: int
-    ) -> tuple[Array, Float32Array]:
+        self, path: Path, stored: Array, count: int, light: LightOf, index: int
+    ) -> tuple[Array, int, LightOf]:
         """Return one channel (P, 1) of the stored pixels and of the linear pixels, without
-        crosstalk.
+        crosstalk; see pixel_reader.
 
         Raises InputError for a gray image.
         """
-        if linear.shape[1] != CHANNELS:
+        if stored.shape[1] != CHANNELS:
             raise InputError(
                 "the image is gray, but --lights-in-channels needs three channels, one for each"
                 " light",
@@ -52,8 +53,12 @@ class ChannelLights:
             )
         channel = index % CHANNELS
         matrix = self.crosstalk[index // CHANNELS % len(self.crosstalk)]
-        unmixed = linear @ np.linalg.inv(matrix)[channel].astype(np.float32)
-        return stored[:, channel, None], np.maximum(unmixed, 0)[:, None]
+        weights = np.linalg.inv(matrix)[channel].astype(np.float32)
+
+        def unmixed(rows: Integers | slice) -> Float32Array:
+            return np.maximum(light(rows) @ weights, 0)[:, None]
+
+        return stored[:, channel, None], count, unmixed
 
     def in_words(self) -> str:
         text = (

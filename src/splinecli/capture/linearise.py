@@ -18,6 +18,7 @@ from splinecli.capture.formats.images import ExpectedSize, decode_image, to_line
 from splinecli.errors import InputError, UsageError
 from splinecli.images.saturation import ImageValues, look_at
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Floats, Integers
+from splinecli.maths.pixel_grid import bounds, slices
 from splinecli.maths.transfer import BT709, TransferCurve, decode_transfer
 from splinecli.records import capture_warnings as codes
 from splinecli.records.capture_warnings import CaptureWarning
@@ -190,10 +191,19 @@ def linear_light(stored: Array, path: Path, curve: TransferCurve = 1.0) -> Float
     return linear
 
 
+# From some of the read pixels to their linear light (p, C)
+LightOf = Callable[[Integers | slice], Float32Array]
+_BLOCK = 1 << 15  # pixels whose values stay in a processor's cache
+
+
 def take_pixels(image: Array, mask: Bools) -> Array:
     """Return image[mask], the pixels (P, C) of an image (H, W, C) in a mask (H, W), but faster."""
+    if not mask.any():
+        return image[:0, 0]
     if mask.all():
         return image.reshape(-1, image.shape[2])
+    rows, columns = (slice(first, last + 1) for first, last in bounds(mask))
+    image, mask = image[rows, columns], mask[rows, columns]
     return np.stack([image[..., channel][mask] for channel in range(image.shape[2])], axis=1)
 
 
@@ -214,12 +224,10 @@ def pixel_reader(
     window: Window,
     wanted: Integers | slice = EVERY_PIXEL,
     around: Bools | None = None,
-) -> Callable[[Path, int], tuple[Array, Float32Array]]:
+) -> Callable[[Path, int], tuple[Array, int, LightOf]]:
     """Return a function from an image and its index to the pixels (P, C) of a mask (H, W): as
-    stored, and linear light.
-
-    The linear values cover only the `wanted` pixels, or all pixels followed by the pixels of the
-    mask `around` (H, W).
+    stored, and the number and the linear light of others, the `wanted` pixels, or all pixels
+    followed by the pixels of the mask `around` (H, W).
 
     The ambient image and a common flat field are read now, once; of several, each image has its
     own. Both functions raise InputError for an unreadable image. Messages name `like` as the image
@@ -230,21 +238,24 @@ def pixel_reader(
 
     def pixels(
         path: Path, like: str = "the other images", wanted: Integers | slice = EVERY_PIXEL
-    ) -> tuple[Array, Float32Array]:
+    ) -> tuple[Array, int, LightOf]:
         """Return the pixels as stored, and linear without ambient light."""
         image = decode_image(path, ExpectedSize(window.shape or mask.shape, like))
         image = window.of(image)
         stored = take_pixels(image, mask)
-        used = (
-            stored[wanted]
-            if around is None
-            else np.concatenate((stored, take_around(image, around)))
-        )
-        linear = linear_light(used, path, radiometry.curve)
-        return stored, linear if ambient is None else np.maximum(linear - ambient[wanted], 0)
+        used = stored[wanted]
+        if around is not None and around.any():
+            used = np.concatenate((stored, take_around(image, around)))
+
+        def light(rows: Integers | slice) -> Float32Array:
+            linear = linear_light(used[rows], path, radiometry.curve)
+            return linear if ambient is None else np.maximum(linear - ambient[wanted][rows], 0)
+
+        return stored, len(used), light
 
     def falloff(path: Path) -> Float32Array:
-        stored, linear = pixels(path)
+        stored, _, light = pixels(path)
+        linear = light(EVERY_PIXEL)
         mean = linear[: len(stored)].mean()
         if mean <= 0:
             raise InputError("the flat-field image is black", path=path)
@@ -252,13 +263,15 @@ def pixel_reader(
         return np.asarray(np.maximum(linear / mean, 0.02), np.float32)
 
     if radiometry.ambient is not None:
-        ambient = pixels(radiometry.ambient)[1]
+        ambient = pixels(radiometry.ambient)[2](EVERY_PIXEL)
     common = falloff(flats[0]) if len(flats) == 1 else None
 
-    def read(path: Path, index: int) -> tuple[Array, Float32Array]:
-        stored, linear = pixels(path, like, wanted)
+    def read(path: Path, index: int) -> tuple[Array, int, LightOf]:
+        stored, count, light = pixels(path, like, wanted)
         flat = falloff(flats[index]) if len(flats) > 1 else common
-        return stored, linear if flat is None else linear / flat[wanted]
+        if flat is None:
+            return stored, count, light
+        return stored, count, lambda rows: light(rows) / flat[wanted][rows]
 
     return read
 
@@ -269,21 +282,30 @@ class StoredPixels:
 
     path: Path  # the image; messages name it
     values: Array  # (P, C), as stored
-    # (P, C) float32, linear light, or (p, C) for the `wanted` pixels of pixel_reader
-    linear: Float32Array
+    # count, light: of the p pixels whose linear light was requested; see pixel_reader
+    count: int
+    light: LightOf
     intensity: Float64Array  # (3,), RGB, of the light
     stated_white_level: int | None = None  # the white level that the file states, or None
 
+    @property
+    def linear(self) -> Float32Array:
+        """The linear light (p, C)."""
+        return self.light(EVERY_PIXEL)
+
     def observe(self) -> Float32Array:
-        """Return observations (P,): each channel is divided by its intensity, then the mean is
+        """Return observations (p,): each channel is divided by its intensity, then the mean is
         taken.
 
         A gray image is equal in all channels.
         """
         weights = 1 / (3 * self.intensity)
-        if self.linear.shape[1] == 1:
+        if self.values.shape[1] == 1:
             weights = weights.sum(keepdims=True)
-        return self.linear @ weights.astype(np.float32)
+        found = np.empty(self.count, np.float32)
+        for part in slices(self.count, _BLOCK):
+            found[part] = self.light(part) @ weights.astype(np.float32)
+        return found
 
     def find_saturated(self, white_level: float | None) -> ImageValues:
         """Return the image statistics that decide which pixels are saturated, from look_at. Raises
@@ -292,12 +314,15 @@ class StoredPixels:
         return look_at(self.values, self.path, given=white_level, stated=self.stated_white_level)
 
     def colours(self) -> Float32Array:
-        """Return linear RGB (P, 3), each channel divided by its intensity; lamps do not tint gray
+        """Return linear RGB (p, 3), each channel divided by its intensity; lamps do not tint gray
         images.
         """
-        if self.linear.shape[1] == 1:
+        if self.values.shape[1] == 1:
             return np.repeat(self.observe()[:, None], 3, axis=1)
-        # In float32 and in place: 24 megapixels take noticeably longer in any other way.
-        colours = np.array(np.broadcast_to(self.linear, (len(self.linear), 3)), np.float32)
-        colours /= self.intensity.astype(np.float32)
+        colours, intensity = (
+            np.empty((self.count, 3), np.float32),
+            self.intensity.astype(np.float32),
+        )
+        for part in slices(self.count, _BLOCK):
+            np.divide(self.light(part), intensity, out=colours[part])
         return colours

@@ -4,6 +4,7 @@ a time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -47,7 +48,7 @@ from splinecli.records.capture_warnings import (
     mask_inverted,
 )
 from splinecli.system.files import equal_files, reading
-from splinecli.system.machine import in_order
+from splinecli.system.machine import count_chosen_cores, in_order
 
 Item = TypeVar("Item")
 Image = TypeVar("Image")
@@ -363,8 +364,8 @@ class CaptureSource(Source):
         wanted: Integers | slice = linearise.EVERY_PIXEL,
         around: Bools | None = None,
     ) -> Iterator[Item]:
-        """Yield use(...) of the pixels of a mask (H, W) under these lights. A second thread reads
-        the next image.
+        """Yield use(...) of the pixels of a mask (H, W) under these lights. Other threads read the
+        next images, on each core one.
 
         Of these pixels (P,), the stored values are complete; for the linear ones, see pixel_reader.
         Raises InputError if an image cannot be read, or does not have the size of the mask.
@@ -382,7 +383,8 @@ class CaptureSource(Source):
                 pixels = self.channels.observe(facts.path, *pixels, number)
             return use(StoredPixels(facts.path, *pixels, intensity, facts.white_level))
 
-        for item in read_ahead(read, indices):
+        threads = readers(self.facts[indices[0]].size, int(np.count_nonzero(mask)))
+        for item in read_ahead(read, indices, threads):
             yield item
             del item  # before the next one is decoded
             progress()
@@ -394,36 +396,53 @@ class CaptureSource(Source):
         like: str,
         wanted: Integers | slice,
         around: Bools | None,
-    ) -> Callable[[Path, int], tuple[Array, Float32Array]]:
+    ) -> Callable[[Path, int], tuple[Array, int, linearise.LightOf]]:
         """Return a reader like pixel_reader's, of images that are moved back as a whole."""
         whole = np.ones(self.facts[0].size[0][:2], np.bool_)
         read = linearise.pixel_reader(
             self.radiometry, whole, like, replace(self.window, box=None, step=1)
         )
 
-        def pixels(path: Path, index: int) -> tuple[Array, Float32Array]:
-            of_file, light = read(path, index)
+        def pixels(path: Path, index: int) -> tuple[Array, int, linearise.LightOf]:
+            of_file, _, light = read(path, index)
             moved = resample(
                 of_file.reshape(*whole.shape, -1),
-                light.reshape(*whole.shape, -1),
+                light(linearise.EVERY_PIXEL).reshape(*whole.shape, -1),
                 transforms[index],
             )
             stored, linear = self.window.of(moved[0]), self.window.of(moved[1])
             used = linearise.take_pixels(linear, mask)[wanted]
             if around is not None:
                 used = np.concatenate((used, linearise.take_around(linear, around)))
-            return linearise.take_pixels(stored, mask), used
+            return linearise.take_pixels(stored, mask), len(used), used.__getitem__
 
         return pixels
 
 
-def read_ahead(read: Callable[[Item], Image], items: Sequence[Item]) -> Iterator[Image]:
-    """Yield read(item) of each item, in order. While one result is used, a thread reads the next.
+def readers(largest: StoredSize, n_pixels: int) -> int:
+    """Return how many images are read at once: one on each core, unless they take more memory than
+    capture_bytes allows.
+    """
+    height, width, *channels = largest[0]
+    # The file, its pixels, and the observations
+    each = height * width * (2 * math.prod(channels) * largest[1] + 4)
+    room = max(n_pixels * BYTES_OF_RESULTS, 1 << 29)  # PyTorch needs as much later
+    return max(1, min(count_chosen_cores(), room // max(each, 1)))
+
+
+def read_ahead(
+    read: Callable[[Item], Image], items: Sequence[Item], threads: int = 1
+) -> Iterator[Image]:
+    """Yield read(item) of each item, in order. While one result is used, threads read the next.
 
     Decoders capture all output to file descriptor 2. If Python's stderr is the same descriptor, the
     items are read one after the other, so that no message is lost.
     """
-    return map(read, items) if len(items) < 2 or not stderr_is_apart() else in_order(read, items)
+    return (
+        map(read, items)
+        if len(items) < 2 or not stderr_is_apart()
+        else in_order(read, items, min(threads, len(items)))
+    )
 
 
 def capture_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:

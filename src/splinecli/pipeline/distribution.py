@@ -29,6 +29,7 @@ from splinecli.system.files import UNFINISHED, made_folder, read_json, refusals_
 from splinecli.system.machine import (
     available_memory,
     count_available_cores,
+    count_chosen_cores,
     import_extra,
     keep_freed_memory,
 )
@@ -101,9 +102,7 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     import dask
     from distributed import LocalCluster
 
-    of_user = os.environ.get("OMP_NUM_THREADS", "")
-    threads = count_available_cores() // options.workers
-    threads = max(1, min(threads, int(of_user)) if of_user.isdecimal() else threads)
+    threads = max(1, min(count_available_cores() // options.workers, count_chosen_cores()))
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
     environment = dict.fromkeys(names, str(threads))
     parts = ("client", "worker", "scheduler")

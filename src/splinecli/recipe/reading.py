@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +15,8 @@ from splinecli.capture.formats.images import to_linear
 from splinecli.capture.linearise import StoredPixels
 from splinecli.images.lamps import COLOUR_SAMPLE
 from splinecli.images.saturation import ImageValues, Saturation, white_level_warnings
-from splinecli.maths import Bools, Float32Array, Integers
+from splinecli.maths import Array, Bools, Float32Array, Integers
+from splinecli.maths.pixel_grid import slices
 from splinecli.records import capture_warnings as codes
 from splinecli.records.capture_warnings import CaptureWarning
 
@@ -53,48 +56,86 @@ def compared_pixels(n_pixels: int) -> Integers:
     return np.linspace(0, n_pixels - 1, min(n_pixels, COLOUR_SAMPLE)).astype(np.intp)
 
 
-def read_observations(
-    images: Iterable[StoredPixels],
-    n_images: int,
-    mask: Bools,
-    around: Bools | None,
-    white_level: float | None,
-) -> Observed:
-    """Return the observations of images, of which one at a time is in memory.
+class Look(NamedTuple):
+    """What is kept of one image."""
 
-    Args:
-        mask, around: (H, W), the pixels of the object, and those around it or None.
-        white_level: given by the user, or None to find it. Raises InputError if it is above an
-            image's full scale.
+    saturated: ImageValues
+    summary: ImageSummary
+    observations: Float32Array  # (P + R,)
+    colours: Float32Array | None  # (p, 3), of the compared pixels; None for a gray image
+
+
+def look_at_image(compared: Integers, white_level: float | None, image: StoredPixels) -> Look:
+    """Return the observations and the values of an image. Raises InputError if the given white
+    level is above its full scale.
     """
-    n_pixels = int(np.count_nonzero(mask))
-    n_around = 0 if around is None else int(np.count_nonzero(around))
-    observations = np.empty((n_pixels + n_around, n_images), np.float32)
-    compared = compared_pixels(n_pixels)
-    found, summaries, colours = list[ImageValues](), list[ImageSummary](), list[Float32Array]()
-    for position, image in enumerate(images):
-        found.append(image.find_saturated(white_level))
-        summaries.append(_summarise(image))
-        observations[:, position] = image.observe()
-        if image.linear.shape[1] == 3:
-            colours.append(replace(image, linear=image.linear[compared]).colours())
-        del image  # before the next one is decoded
-    saturation = Saturation(n_pixels, tuple(found), white_level)
+    colours = replace(image, count=len(compared), light=lambda rows: image.light(compared[rows]))
+    return Look(
+        image.find_saturated(white_level),
+        _summarise(image),
+        image.observe(),
+        colours.colours() if image.values.shape[1] == 3 else None,
+    )
+
+
+_AT_ONCE, _ROWS = 4, 1 << 14  # images and pixels that are placed at once
+
+
+def gather_observations(
+    images: Iterable[Look], n_images: int, mask: Bools, white_level: float | None
+) -> Observed:
+    """Return the observations of images of a mask (H, W); the white level is None to find it."""
+    n_pixels, observations = int(np.count_nonzero(mask)), np.empty((0, n_images), np.float32)
+    looks, waiting = list[Look](), list[Float32Array]()
+    for position, look in enumerate(images, 1):
+        waiting.append(look.observations)
+        looks.append(look._replace(observations=_NOTHING))
+        if position == 1:
+            observations = np.empty((len(look.observations), n_images), np.float32)
+        del look
+        # Writing every column on its own would pass through the whole array for each image.
+        if len(waiting) == _AT_ONCE or position == n_images:
+            for rows in slices(len(observations), _ROWS):
+                for column, each in enumerate(waiting, position - len(waiting)):
+                    observations[rows, column] = each[rows]
+            waiting.clear()
+    saturation = Saturation(n_pixels, tuple(look.saturated for look in looks), white_level)
+    colours = [look.colours for look in looks if look.colours is not None]
     return Observed(
         observations,
         saturation,
-        tuple(_relative(summaries, saturation)),
-        np.stack(colours) if len(colours) == len(found) else None,
+        tuple(_relative([look.summary for look in looks], saturation)),
+        np.stack(colours) if len(colours) == len(looks) else None,
     )
+
+
+_NOTHING = np.empty(0, np.float32)
+
+
+@lru_cache(maxsize=1)
+def _enough_rows(n_pixels: int) -> Integers:
+    # at random: pixels at equal distances may be in a few columns
+    return np.random.default_rng(0).integers(n_pixels, size=_ENOUGH)
 
 
 def _summarise(image: StoredPixels) -> ImageSummary:
     """Return the summary of an image, relative to its full scale."""
     stored = image.values
-    if len(stored) > _ENOUGH:  # at random: pixels at equal distances may be in a few columns
-        stored = stored[np.random.default_rng(0).integers(len(stored), size=_ENOUGH)]
-    bright = float(np.quantile(to_linear(stored, image.path), 0.99))
+    if len(stored) > _ENOUGH:
+        stored = stored.take(_enough_rows(len(stored)), axis=0)
+    bright = float(_quantile(stored, image.path, 0.99))
     return ImageSummary(image.path, image.values.shape[1], str(image.values.dtype), bright)
+
+
+def _quantile(stored: Array, path: Path, share: float) -> Float32Array:
+    """Return a quantile of stored values, on the scale of to_linear."""
+    if stored.dtype.kind != "u":
+        return np.quantile(to_linear(stored, path), share)
+    up_to = np.bincount(stored.reshape(-1)).cumsum()
+    place = share * (up_to[-1] - 1)
+    around = np.searchsorted(up_to, (math.floor(place), math.ceil(place)), side="right")
+    lower, upper = to_linear(around.astype(stored.dtype), path)
+    return np.asarray(lower + (upper - lower) * (place % 1), np.float32)
 
 
 def _relative(images: Sequence[ImageSummary], saturation: Saturation) -> Iterable[ImageSummary]:

@@ -41,7 +41,7 @@ def compare_colours(
     rows = compared_pixels(int(np.count_nonzero(mask)))
     colours = []
     for pixels in source.read_pixels(mask, indices, lambda each: each, advance, wanted=rows):
-        if pixels.linear.shape[1] != 3:
+        if pixels.values.shape[1] != 3:
             return None, []
         colours.append(pixels.colours())
     return lamp_colours(np.stack(colours))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -33,7 +34,13 @@ from splinecli.lights.outline import is_outlined
 from splinecli.maths import Float64Array
 from splinecli.maths.transfer import SRGB
 from splinecli.recipe.contradiction import ask_network
-from splinecli.recipe.reading import Observed, exposure_warnings, read_observations
+from splinecli.recipe.reading import (
+    Observed,
+    compared_pixels,
+    exposure_warnings,
+    gather_observations,
+    look_at_image,
+)
 from splinecli.recipe.registration import compare_colours, register
 from splinecli.recipe.work import USUAL, RecipeOptions, Work
 from splinecli.records.capture_warnings import (
@@ -108,8 +115,11 @@ def observe(work: Work, advance: Callable[[], object]) -> Work:
     around = surroundings(mask) if sharpens else None
 
     def read(source: Source) -> Observed:
-        images = source.read_pixels(mask, indices, lambda each: each, advance, around=around)
-        return read_observations(images, len(indices), mask, around, source.white_level)
+        look = partial(
+            look_at_image, compared_pixels(int(np.count_nonzero(mask))), source.white_level
+        )
+        images = source.read_pixels(mask, indices, look, advance, around=around)
+        return gather_observations(images, len(indices), mask, source.white_level)
 
     observed = read(source)
     if observed.colours is not None and _compares_colours(work):

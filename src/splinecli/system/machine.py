@@ -274,6 +274,14 @@ def count_available_cores() -> int:
     return max(1, int(min(limits)))
 
 
+def count_chosen_cores() -> int:
+    """Return the number of available cores, or OMP_NUM_THREADS if that is less: workers share the
+    cores in this way.
+    """
+    chosen, cores = os.environ.get("OMP_NUM_THREADS", ""), count_available_cores()
+    return max(1, min(cores, int(chosen))) if chosen.isdecimal() else cores
+
+
 def cgroup_quotas() -> list[float]:
     """Return the CPU quotas, in cores, of this process's control groups and their parents."""
     quotas = []

@@ -14,7 +14,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
@@ -53,35 +53,66 @@ def damage_as_input_error(path: Path, problem: str, hint: str | None = None) -> 
         raise InputError(problem, path, hint=hint) from error
 
 
-_STDERR_LOCK = threading.Lock()
+class _Redirected:
+    """File descriptor 2, redirected to a file while `users` threads decode."""
+
+    def __init__(self) -> None:
+        self.turn, self.changed, self.users = threading.Lock(), threading.Condition(), 0
+        self._store: BinaryIO | None = None
+        self._original = -1
+
+    def enter(self) -> tuple[BinaryIO | None, int]:
+        """Return the file, or None without a stderr, and its length before this thread's
+        messages.
+        """
+        self.users += 1
+        if self.users == 1:
+            with suppress(OSError, ValueError):  # without a stderr, nothing needs protection
+                if sys.stderr is not None:
+                    sys.stderr.flush()
+                self._original = os.dup(2)
+                self._store = tempfile.TemporaryFile()  # noqa: SIM115 - until the last one leaves
+                os.dup2(self._store.fileno(), 2)
+        return self._store, 0 if self._store is None else os.fstat(self._store.fileno()).st_size
+
+    def leave(self) -> None:
+        self.users -= 1
+        if not self.users and self._original >= 0:
+            os.dup2(self._original, 2)
+            os.close(self._original)
+            if self._store is not None:
+                self._store.close()
+            self._store, self._original = None, -1
+        self.changed.notify_all()
+
+
+_STDERR = _Redirected()
 
 
 @contextmanager
-def native_stderr() -> Iterator[list[str]]:
+def native_stderr(*, alone: bool = False) -> Iterator[list[str]]:
     """Capture the messages that C libraries print to stderr; after the block, the list contains
     them.
 
-    This replaces file descriptor 2, which belongs to the whole process. So one thread at a time may
-    do it, and only around decoding. Output of other threads is lost meanwhile, unless it goes
-    elsewhere (stderr_is_apart).
+    This replaces file descriptor 2, which belongs to the whole process, so use it only around
+    decoding. Output of other threads is lost meanwhile, unless it goes elsewhere (stderr_is_apart).
+    Several threads may decode at once. The list then contains the messages of all of them, unless
+    the block waits until it is `alone`.
     """
     messages: list[str] = []
-    with _STDERR_LOCK, tempfile.TemporaryFile() as store:
+    with _STDERR.turn if alone else nullcontext():
+        with nullcontext() if alone else _STDERR.turn, _STDERR.changed:
+            if alone:
+                _STDERR.changed.wait_for(lambda: not _STDERR.users)
+            store, start = _STDERR.enter()
         try:
-            if sys.stderr is not None:
-                sys.stderr.flush()
-            original = os.dup(2)
-        except (OSError, ValueError):  # without a stderr, nothing needs protection
-            yield messages
-            return
-        try:
-            os.dup2(store.fileno(), 2)
             yield messages
         finally:
-            os.dup2(original, 2)
-            os.close(original)
-            store.seek(0)
-            messages.append(store.read(1 << 16).decode(errors="replace"))
+            with _STDERR.changed:
+                if store is not None:
+                    found = os.pread(store.fileno(), 1 << 20, start)
+                    messages.append(found.decode(errors="replace"))
+                _STDERR.leave()
 
 
 def stderr_is_apart() -> bool:

@@ -212,16 +212,10 @@ def _decode_with_opencv(data: bytes | bytearray) -> Array:
     """
     import cv2
 
-    with decoders.native_stderr() as messages:
-        try:
-            # IMREAD_UNCHANGED keeps 16 bits and the alpha channel, and leaves the EXIF orientation
-            # alone.
-            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error as error:
-            if error.code == cv2.Error.StsNoMem:
-                raise MemoryError from None
-            raise
-    if pixels is None or _DAMAGE.search("".join(messages)):
+    pixels, damaged = _imdecode(data)
+    if damaged:  # perhaps another file, which another thread decoded at the same time
+        pixels, damaged = _imdecode(data, alone=True)
+    if pixels is None or damaged:
         raise ValueError
     if pixels.ndim == 2 or pixels.shape[2] not in (3, 4):
         return pixels
@@ -230,6 +224,24 @@ def _decode_with_opencv(data: bytes | bytearray) -> Array:
         # In place, and far faster than an index
         return cv2.cvtColor(pixels, code, dst=pixels)
     return pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]]
+
+
+def _imdecode(data: bytes | bytearray, *, alone: bool = False) -> tuple[Array | None, bool]:
+    """Return OpenCV's pixels or None, and whether a decoder reported damage; see native_stderr for
+    `alone`.
+    """
+    import cv2
+
+    with decoders.native_stderr(alone=alone) as messages:
+        try:
+            # IMREAD_UNCHANGED keeps 16 bits and the alpha channel, and leaves the EXIF orientation
+            # alone.
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error as error:
+            if error.code == cv2.Error.StsNoMem:
+                raise MemoryError from None
+            raise
+    return pixels, _DAMAGE.search("".join(messages)) is not None
 
 
 def _check_png(data: bytes, path: Path) -> None:
