@@ -50,6 +50,8 @@ def report_interruption() -> int:
     code.
     """
     with suppress(OSError):  # stderr may be closed
+        if os.isatty(2):  # the process may end while a progress bar is shown
+            os.write(2, b"\r\x1b[2K\x1b[?25h")
         if not TOLD.is_set():
             os.write(2, b"splinecli: interrupted.\n")
     return INTERRUPTED

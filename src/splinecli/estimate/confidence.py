@@ -133,10 +133,13 @@ class PixelScale:
         """Return for pixels (n, 2): log of their relative brightness, and of the rotation by near
         lamps in degrees.
         """
-        places = self.places(rows, columns)
-        turn = np.einsum("kij,pi,pj->pk", self.turning, normals, places, optimize=True)
-        turn -= np.einsum("pk,pk->p", turn, normals)[:, None] * normals
-        turn_deg = np.degrees(np.arctan(np.linalg.norm(turn, axis=1)))
+        turn_deg: Floats = np.zeros(len(normals))
+        if self.turning.any():
+            places = self.places(rows, columns).astype(np.float32)
+            both = (normals[:, :, None] * places[:, None]).reshape(-1, 6)
+            turn = both @ self.turning.reshape(3, 6).T.astype(np.float32)
+            turn -= (turn * normals).sum(axis=1, keepdims=True) * normals
+            turn_deg = np.degrees(np.arctan(np.linalg.norm(turn, axis=1)))
         return np.stack((np.log(brightness / self.bright + 1e-3), np.log(turn_deg + 0.3)), axis=1)
 
     def places(self, rows: Integers, columns: Integers) -> Float64Array:

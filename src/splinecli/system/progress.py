@@ -29,6 +29,10 @@ STAGES = (
 )
 
 
+# The seconds of a stage over those that were expected, of this process's latest capture
+_PACES: dict[str, float] = {}
+
+
 class Advance(Protocol):
     """Move the progress of a stage by `amount`; `note` is a short text to show beside it."""
 
@@ -44,11 +48,16 @@ class Clock:
     def __init__(self, show: Advance | None = None) -> None:
         self._seconds = dict.fromkeys(STAGES, 0.0)
         self._stage, self._since = STAGES[0], time.perf_counter()
-        self._show, self._shares = show, dict[str, float]()
-        self._shown = self._end = 0.0  # places on the bar: now, and at the end of the stage
+        self._show, self._shares, self._expected = show, dict[str, float](), dict[str, float]()
+        # places on the bar: now, and at the beginning and the end of the stage
+        self._shown = self._start = self._end = 0.0
 
     def expect(self, seconds: Mapping[str, float]) -> None:
-        """Divide the rest of the bar between stages by their expected seconds."""
+        """Divide the rest of the bar between stages by their expected seconds, which earlier clocks
+        of this process correct.
+        """
+        self._expected |= seconds
+        seconds = {stage: each * _PACES.get(stage, 1.0) for stage, each in seconds.items()}
         whole = sum(seconds.values()) / (1 - self._end)
         self._shares = {stage: each / whole for stage, each in seconds.items()}
 
@@ -59,10 +68,10 @@ class Clock:
         """
         now = time.perf_counter()
         self._seconds[self._stage] += now - self._since
+        if stage != self._stage or stage in self._shares:  # otherwise another part of the same
+            self._start, self._end = self._end, self._end + self._shares.pop(stage, 0.0)
         self._stage, self._since = stage, now
-        start, share = self._end, self._shares.pop(stage, 0.0)
-        self._end += share
-        done = 0.0
+        start, share, done = self._start, self._end - self._start, 0.0
 
         def advance(amount: float, note: str = note) -> None:
             nonlocal done
@@ -82,6 +91,9 @@ class Clock:
         now = time.perf_counter()
         self._seconds[self._stage] += now - self._since
         self._since = now
+        for stage, expected in self._expected.items():
+            if expected > 0 and self._seconds[stage] > 0:
+                _PACES[stage] = self._seconds[stage] / expected
         return {stage: round(seconds, 3) for stage, seconds in self._seconds.items()} | {
             "total": round(sum(self._seconds.values()), 3)
         }

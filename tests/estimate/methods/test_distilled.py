@@ -222,7 +222,7 @@ def test_too_few_pixels():
 
 def test_sizes_grow_with_the_capture():
     assert student_sizes(100_000)[0] == StudentSize(sample=10_000, steps=833, width=96)
-    assert student_sizes(1_600_000)[0].sample == 20_000
+    assert student_sizes(1_600_000)[0].sample == 15_157
     assert student_sizes(8_000)[0].sample == 2000
     for n_pixels in (1000, 100_000, 24_000_000):
         usual, larger = student_sizes(n_pixels)

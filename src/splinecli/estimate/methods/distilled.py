@@ -419,9 +419,9 @@ def distil(
     perceptron = Perceptron(lights, size.width, generator).to(teacher.device)
     with torch.inference_mode(False):  # its tensors could not be changed in place outside of it
         inputs = _inputs(perceptron, candidates, directions, teacher.device)
-        # At most 0.5 % of the pixels, and as many as the sample, are of rare kinds and go through
-        # the network.
-        rare_share = min(0.005, size.sample / n_pixels)
+        # At most 0.5 % of the pixels, and half as many as the sample, are of rare kinds and go
+        # through the network.
+        rare_share = min(0.005, 0.5 * size.sample / n_pixels)
         sample = draw_sample(inputs, size.sample, generator, rare_share=rare_share)
         pixels = sample.rows.numpy()
         taught = teacher.estimate_with_error(

@@ -223,9 +223,24 @@ class CaptureHead(nn.Module):
         The features of the capture (20,) or (P, 20) are in the order of CaptureFeatures. NaN means
         unknown.
         """
-        inputs = torch.cat((errors, pixels, capture.expand(len(errors), -1)), dim=1)
-        inputs = ((inputs - self.mean) / self.spread).nan_to_num(0.0).clamp(-_MOST, _MOST)
-        found = self.linear(inputs) + self.last(self.hidden(inputs).tanh())
+        own = torch.cat((errors, pixels), dim=1)
+        count = own.shape[1]
+        own, shared = (
+            ((values - mean) / spread).nan_to_num(0.0).clamp(-_MOST, _MOST)
+            for values, mean, spread in zip(
+                (own, capture),
+                self.mean.tensor_split((count,)),
+                self.spread.tensor_split((count,)),
+                strict=True,
+            )
+        )
+
+        def apply(layer: nn.Linear) -> Tensor:
+            # The features of the capture are usually those of all pixels, so they are one product.
+            of_pixels, of_capture = layer.weight.tensor_split((count,), dim=1)
+            return linear(own, of_pixels) + linear(shared, of_capture, layer.bias)
+
+        found = apply(self.linear) + self.last(apply(self.hidden).tanh())
         median = torch.logaddexp(errors[:, 0] + found[:, 0], found[:, 1])
         # Gamma-encoded values rotate the normals by about this angle, however good the fit is
         # otherwise.
