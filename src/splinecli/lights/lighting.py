@@ -181,6 +181,10 @@ class IndirectLight:
         return np.asarray(self.at(pixels).max(axis=1) > 0.02 * observations.max(axis=1))
 
 
+# Pixels from which the light between parts is gathered, several hundred for each block
+_GATHERED = 500_000
+
+
 def find_indirect_light(
     mask: Bools, observations: Float32Array, lighting_at: LightingAt, normals: Float32Array
 ) -> IndirectLight | None:
@@ -193,7 +197,9 @@ def find_indirect_light(
     directions. The normals (P, 3) are unit, in the capture's frame.
     """
     pixels = PixelPlaces(mask)
+    step = max(1, len(normals) // _GATHERED)
     parts = partial(parts_of_pixels, len(normals))
+    some = partial(parts, step=step)
 
     def matte_albedo(rows: PixelIndices) -> Float32Array:
         light = lighting_at(rows)
@@ -201,7 +207,7 @@ def find_indirect_light(
         shaded = np.square(cosines).sum(axis=1).clip(min=1e-6)
         return np.asarray((light.observations * cosines).sum(axis=1) / shaded, np.float32)
 
-    albedo = np.concatenate([*side_by_side(matte_albedo, parts())])
+    albedo = np.concatenate([*side_by_side(matte_albedo, some())])
     total = float(albedo.sum(dtype=np.float64))
     if total <= 0:
         return None
@@ -209,31 +215,37 @@ def find_indirect_light(
     bright = float(albedo @ albedo) / total
     lit = albedo > 0.02 * bright  # darker ones are background
     object_mask = mask.copy()
-    object_mask[mask] = lit
+    object_mask[mask] = lit.repeat(step)[: len(normals)]
     blocks = Blocks.over(object_mask, 1200)
+    if step > 1:  # only the blocks that contain one of these pixels
+        object_mask[mask] &= np.arange(len(normals)) % step == 0
+        blocks = Blocks.of_step(object_mask, blocks.step)
     n_blocks = np.count_nonzero(blocks.mask)
 
     def sum_up(rows: PixelIndices) -> Float64Array:
-        rows = rows[lit[rows]]
+        rows = rows[lit[rows // step]]
         # Limit the light that a block sends to this multiple of a matte block that faces the lamp.
         # The rest is a highlight, which is reflected in another direction.
-        most = 3.0 * albedo[rows, None]
+        most = 3.0 * albedo[rows // step, None]
         sent = observations[rows] * (most / lighting_at(rows).observations.clip(min=most))
         number = blocks.numbers_at(*pixels.places(rows))
         values = np.hstack((np.ones((len(rows), 1)), normals[rows], sent))
         return np.stack([np.bincount(number, column, n_blocks) for column in values.T], axis=1)
 
-    sums = sum(side_by_side(sum_up, parts()), np.zeros(()))
+    sums = sum(side_by_side(sum_up, some()), np.zeros(()))
     count = sums[:, :1]
-    covered = count[:, 0] / blocks.step**2
+    covered = step * count[:, 0] / blocks.step**2
     arriving = _exchange(blocks, covered, unit(sums[:, 1:4]), sums[:, 4:] / count)
-    indirect = IndirectLight(blocks, blocks.spread(arriving), albedo, pixels)
-    exposure = _exposure(indirect, observations, lighting_at, normals)
+    reflected = albedo[lit]
+    indirect = IndirectLight(blocks, blocks.spread(arriving), albedo.repeat(step), pixels)
+    exposure = _exposure(indirect, observations, lighting_at, normals, step)
     if exposure is None:
         return None
     # Limit this quantile of the albedo. It may exceed 1, because the gathered light is too weak if
     # the camera does not show the reflecting surface.
-    exposure = min(exposure, 1.4 / float(np.quantile(albedo[lit], 0.98)))
+    exposure = min(exposure, 1.4 / float(np.quantile(reflected, 0.98)))
+    if step > 1:
+        albedo = np.concatenate([*side_by_side(matte_albedo, parts())])
     # The albedo of pixels at grazing angles to all lamps is arbitrary.
     return replace(indirect, albedo=(exposure * albedo).clip(max=10.0).astype(np.float16))
 
@@ -268,15 +280,17 @@ def _exposure(
     observations: Float32Array,
     lighting_at: LightingAt,
     normals: Float32Array,
+    step: int,
 ) -> float | None:
     """Return the factor from albedos in the unit of the observations to true albedos.
 
     None without visible indirect light. The factor is fitted to attached shadows, together with
     uniform ambient light. In a round bowl under a ring of lights, indirect light is just as
-    uniform, and the fit attributes it to the indirect part.
+    uniform, and the fit attributes it to the indirect part. The albedo is known at every `step`-th
+    pixel.
     """
     found = []
-    step = max(1, len(normals) // 50_000)
+    step *= max(1, len(normals) // (50_000 * step))
     for pixels in parts_of_pixels(len(normals), step=step):
         light = lighting_at(pixels)
         gathered = indirect.at(pixels)

@@ -159,7 +159,8 @@ def compare_halves(observations: Tensor, light_directions: Tensor, signs: Tensor
     """Fit all lights, and compare the fits of two halves.
 
     The observations (P, F) of each pixel are scaled to a largest value of 1, and the light
-    directions (F, 3) or (P, F, 3) are unit, all in float64. The signs (F,) are 1 and -1 for the two
+    directions (F, 3) or (P, F, 3) are unit, in float64; observations under shared lights may be in
+    float32. The signs (F,) are 1 and -1 for the two
     halves, the same for all pixels of a capture; see alternating_signs.
     """
     gram = light_directions.mT @ light_directions
@@ -176,19 +177,22 @@ def compare_halves(observations: Tensor, light_directions: Tensor, signs: Tensor
 
     shared = light_directions.ndim == 2
     # It is linear, and so one matrix if all pixels have the same lights.
-    found = (
-        observations @ compare(torch.eye(len(signs)).to(gram)) if shared else compare(observations)
-    )
+    if shared:
+        found = observations @ compare(torch.eye(len(signs)).to(gram)).to(observations)
+    else:
+        found = compare(observations)
     scaled, change, difference = torch.split(found, [3, 3, 1], dim=1)
     albedo = scaled.norm(dim=-1, keepdim=True).clamp(min=_TINY)
     normals = scaled / albedo
     # Part of the signs is explained by some normal, and residuals are perpendicular to it. The rest
     # measures noise.
-    signs = signs.to(scaled).expand(1 if shared else len(scaled), -1)
+    signs = signs.to(gram).expand(1 if shared else len(scaled), -1)
     seeing = (signs - dot(solve(signs), light_directions)).norm(dim=-1, keepdim=True)
-    along = ((normals[:, None] @ covariance)[:, 0] * normals).sum(dim=-1, keepdim=True)
-    across = covariance.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None] - along
-    noise = difference / seeing.clamp(min=_TINY) * across.clamp(min=0).sqrt()
+    spread = covariance.to(scaled)
+    turned = normals @ spread if shared else (normals[:, None] @ spread)[:, 0]
+    across = spread.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None]
+    across = across - (turned * normals).sum(dim=-1, keepdim=True)
+    noise = difference / seeing.clamp(min=_TINY).to(scaled) * across.clamp(min=0).sqrt()
     return TwoHalves(normals, change / albedo, noise / albedo)
 
 

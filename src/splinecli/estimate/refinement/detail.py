@@ -126,7 +126,7 @@ def enlarge(maps: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     weights = mask.to(maps)[None]
     weighed = torch.cat((maps * weights, weights))[None]
     found = interpolate(weighed, scale_factor=2, mode="bilinear")[0]
-    return found[:-1] / found[-1:].clamp(min=1e-6)
+    return found[:-1].div_(found[-1:].clamp_(min=1e-6))
 
 
 def _over_blocks(function: np.ufunc, values: Array) -> Array:
@@ -188,12 +188,12 @@ def restore_octave(
     """
     mask = mask * least_squares.any(dim=0)
     largest = largest * mask
-    detail, missing = (
-        (maps - unit_maps(_without_octave(maps, largest))) * mask
-        for maps in (estimated, least_squares)
-    )
-    noise = (noise - _without_octave(noise, largest)) * mask
-    return unit_maps(enlarged + _real_share(missing * largest, noise * largest) * detail)
+    halved = _without_octave(torch.cat((estimated, least_squares, noise)), largest)
+    of_estimated, of_least_squares, of_noise = torch.split(halved, [3, 3, 1])
+    detail = (estimated - unit_maps(of_estimated)).mul_(mask)
+    missing = (least_squares - unit_maps(of_least_squares)).mul_(largest)
+    noise = (noise - of_noise).mul_(largest)
+    return unit_maps(detail.mul_(_real_share(missing, noise)).add_(enlarged))
 
 
 def _real_share(missing: Tensor, noise: Tensor) -> Tensor:

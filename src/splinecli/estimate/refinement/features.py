@@ -76,10 +76,11 @@ def refine_features(
 
 
 def two_halves(observed: Tensor, light_directions: Tensor, signs: Tensor) -> TwoHalves:
-    """Return compare_halves in double precision, from observations (P, F) with a largest value of
-    1.
+    """Return compare_halves in the precision of the observations (P, F), whose largest value is 1.
+    Each pixel's own lights are solved for in double precision.
     """
-    found = least_squares.compare_halves(observed.double(), light_directions.double(), signs)
+    values = observed if light_directions.ndim == 2 else observed.double()
+    found = least_squares.compare_halves(values, light_directions.double(), signs)
     return TwoHalves(*(values.to(observed) for values in found))
 
 

@@ -256,14 +256,13 @@ class NetworkRefiner:
         `values_of` gives them from rows of the capture, their light and their slice of the tile's
         pixels.
         """
-        maps = torch.zeros(*tile.mask.shape, columns, device=self._device)
+        maps = torch.zeros(columns, *tile.mask.shape, device=self._device)
         rows = tile.rows[tile.mask]
         places = torch.from_numpy(np.flatnonzero(tile.mask)).to(self._device)
         for part in slices(len(rows), LIT_AT_ONCE):
-            maps.view(-1, columns)[places[part]] = values_of(
-                rows[part], lighting_at(rows[part]), part
-            )
-        return maps.permute(2, 0, 1)
+            values = values_of(rows[part], lighting_at(rows[part]), part)
+            maps.view(columns, -1)[:, places[part]] = values.T
+        return maps
 
     def _average_turns(
         self, features: torch.Tensor, mask: torch.Tensor, wanted: Box, turns: int
