@@ -10,7 +10,7 @@ from splinecli.system.progress import Clock
 def time(monkeypatch):
     """Seconds [now] of a clock that only tests move."""
     now = [0.0]
-    monkeypatch.setattr(progress.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
     monkeypatch.setattr(progress, "_PACES", {})
     return now
 

@@ -56,7 +56,7 @@ class ChannelLights:
         weights = np.linalg.inv(matrix)[channel].astype(np.float32)
 
         def unmixed(rows: Integers | slice) -> Float32Array:
-            return np.maximum(light(rows) @ weights, 0)[:, None]
+            return np.asarray(np.maximum(light(rows) @ weights, 0)[:, None], np.float32)
 
         return stored[:, channel, None], count, unmixed
 

@@ -130,7 +130,7 @@ def _summarise(image: StoredPixels) -> ImageSummary:
 def _quantile(stored: Array, path: Path, share: float) -> Float32Array:
     """Return a quantile of stored values, on the scale of to_linear."""
     if stored.dtype.kind != "u":
-        return np.quantile(to_linear(stored, path), share)
+        return np.asarray(np.quantile(to_linear(stored, path), share), np.float32)
     up_to = np.bincount(stored.reshape(-1)).cumsum()
     place = share * (up_to[-1] - 1)
     around = np.searchsorted(up_to, (math.floor(place), math.ceil(place)), side="right")
