@@ -25,7 +25,7 @@ from splinecli.capture import Capture, open_capture
 from splinecli.capture import source as module
 from splinecli.capture.formats.images import decode_image
 from splinecli.capture.source import read_ahead
-from splinecli.errors import UsageError
+from splinecli.errors import InputError, UsageError
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.recipe import prepare_capture, read_capture
 from splinecli.system.machine import in_order
