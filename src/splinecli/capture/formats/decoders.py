@@ -110,9 +110,19 @@ def native_stderr(*, alone: bool = False) -> Iterator[list[str]]:
         finally:
             with _STDERR.changed:
                 if store is not None:
-                    found = os.pread(store.fileno(), 1 << 20, start)
-                    messages.append(found.decode(errors="replace"))
+                    messages.append(_read_from(store.fileno(), start).decode(errors="replace"))
                 _STDERR.leave()
+
+
+def _read_from(descriptor: int, start: int) -> bytes:
+    """Return the bytes of a file after `start`, without moving the place where others write."""
+    if hasattr(os, "pread"):
+        return os.pread(descriptor, 1 << 20, start)
+    place = os.lseek(descriptor, 0, os.SEEK_CUR)  # Windows
+    os.lseek(descriptor, start, os.SEEK_SET)
+    found = os.read(descriptor, 1 << 20)
+    os.lseek(descriptor, place, os.SEEK_SET)
+    return found
 
 
 def stderr_is_apart() -> bool:
