@@ -32,6 +32,8 @@ _GRID_PIXELS, _MOST_LIGHTS = 500, 30
 _STEPS, _STEP, _OWN_STEP = 14, 0.06, 0.01  # in common, and of each light by itself
 # for a doubt about given lights
 _FEW_PIXELS, _FEW_STEPS, _DOUBT_DEG = 250, 8, 10.0
+# which is given up if the cost falls by less in the first half of the steps, as under right lights
+_HALF_FALL = 0.25
 # Weights, in units of the logarithm of the expected error: of the curl of the normals, of the
 # distance from the start, and of the spread of the albedo, which unknown intensities would tilt
 # (Alldrin, Mallick and Kriegman, "Resolving the generalized bas-relief ambiguity by entropy
@@ -137,7 +139,12 @@ class LightWitness:
         start = Lights(given, np.ones(len(given)))
         with one_thread_each():
             better = _follow(
-                self.images, errors, start, intensities_known=intensities_known, steps=_FEW_STEPS
+                self.images,
+                errors,
+                start,
+                intensities_known=intensities_known,
+                steps=_FEW_STEPS,
+                half_fall=_HALF_FALL,
             )
         moved_deg = float(angle_between_deg(better.lights.directions, given).mean())
         return self.cost(self.given) - better.cost, moved_deg
@@ -227,6 +234,7 @@ def _follow(
     *,
     intensities_known: bool,
     steps: int = _STEPS,
+    half_fall: float = 0.0,
 ) -> _Followed:
     """Return the best lights on the way of a gradient descent (Adam, Kingma and Ba, ICLR 2015) from
     a start. All lights move together by a matrix, and each a little by itself.
@@ -256,12 +264,16 @@ def _follow(
         cost = expected + _CURL * (curl + 0.02).log() + _NEAR * near + 100 * low
         if not intensities_known:
             cost = cost + _ALBEDO * (spread + 0.05).log()
+        if not number:
+            first = cost.item()
         if cost.item() < least:
             least = cost.item()
             found = Lights(
                 unit(lights.detach().double().numpy()), relative.detach().double().exp().numpy()
             )
             best = _Followed(found, expected.item(), curl.item())
+        if number == steps // 2 and first - least < half_fall:
+            break
         if number < steps:
             share = 0.53 + 0.5 * np.cos(np.pi * number / (steps + 1))
             for group, step in zip(descent.param_groups, sizes.values(), strict=True):
