@@ -128,14 +128,15 @@ def test_saturated_pixels_are_restored_unless_as_stored(run, capture):
 
 
 @pytest.fixture
-def cube(coarse_shapes):
-    """A cube's mesh, its top turned to the camera. Other shapes are coarser, for speed."""
+def cube():
+    """A cube's mesh, its top turned to the camera."""
     pytest.importorskip("embreex")
     corners = "".join(f"v {x} {y} {z}\n" for x in (-1, 1) for y in (-1, 1) for z in (-1, 1))
     sides = "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
     return put("cube.obj", corners + sides)
 
 
+@pytest.mark.usefixtures("coarse_shapes")  # for speed
 def test_scenes_and_a_mesh_are_rendered(run, cube):
     arguments = f"prepare --mesh {cube} --size 16 --n-lights 20 -o set"
     result = run(f"{arguments} --scenes 1")

@@ -9,7 +9,16 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from cli.conftest import EXAMPLE, read_report
-from scenes import BUMP_LAMPS, codes, parametrize, read_image, to_uint16, write_bump, write_image
+from scenes import (
+    BUMP_LAMPS,
+    codes,
+    parametrize,
+    read_image,
+    read_json,
+    to_uint16,
+    write_bump,
+    write_image,
+)
 from splinecli.maths.normals import angle_between_deg, unit
 
 
@@ -115,9 +124,8 @@ def test_mended_lights(run, medallion):
     for name in ("mended.lp", "mended.npy"):
         run(f"info {medallion} --mended-lights {name}")
         run(f"infer {medallion} --lights {name} --method ls --strict -o {name[-3:]}", err="")
-        assert_allclose(
-            read_report(Path(name[-3:], "medallion"))["light_directions"], right, atol=1e-5
-        )
+        found = read_json(Path(name[-3:], "medallion/report.json"))["light_directions"]
+        assert_allclose(found, right, atol=1e-5)
     for suffix in ("json", "mat", "yml", "xml"):
         run(
             f"info {medallion} --mended-lights mended.{suffix}",

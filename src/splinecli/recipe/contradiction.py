@@ -14,7 +14,6 @@ photographed objects, whose lights were measured, the cost falls by 0.4 at most.
 from splinecli.judge.checks import Finding, Judgement, Remedy
 from splinecli.judge.light_check import WRITES_MENDED
 from splinecli.lights.light_fit import refine_lights
-from splinecli.lights.unknown_lights import find_lights
 from splinecli.maths.normals import angle_between_deg
 from splinecli.recipe.work import Work
 from splinecli.records.capture_warnings import (
@@ -39,6 +38,7 @@ def ask_network(work: Work, judgement: Judgement) -> Judgement:
     Raises ModelError.
     """
     from splinecli.estimate.light_descent import LightWitness, best_lights
+    from splinecli.lights.unknown_lights import find_lights
 
     capture = work.made
     near = capture.lamps is not None or capture.camera_matrix is not None
