@@ -151,12 +151,55 @@ def test_two_masks_of_a_ball_are_named(run):
     run("calibrate ball", says=(says, "from picture"))
 
 
+def test_a_ball_in_jpeg_images(run):
+    """Decoded, the lamp is 20 times as bright as the ball; stored values are only 4 times as
+    high.
+    """
+    Path("jpeg").mkdir()
+    for number, half in enumerate(halfway(LIGHTS)):
+        spot = (NORMALS @ half).clip(0) ** 200
+        cv2.imwrite(f"jpeg/{number}.jpg", np.where(INSIDE, 64 + 191 * spot, 0).round())
+    cv2.imwrite("mask.png", INSIDE.astype(np.uint8) * 255)
+    run("calibrate jpeg --mask mask.png", says="from mask")
+    assert angles_deg(read_light_directions("calibration/light_directions.txt", 4)).max() < 1.5
+
+
+def test_the_picture_shows_where_no_highlight_was_found(run):
+    write_balls("dark", LIGHTS[:2])
+    cv2.imwrite("dark/2.png", np.full(SIZE, 900, np.uint16))
+    says = "dark/2.png: found no highlight in the ball. calibration/calibration.png shows the"
+    run("calibrate dark --circle 60,48,40", code=3, says=says)
+    assert [path.name for path in Path("calibration").iterdir()] == ["calibration.png"]
+    assert cv2.imread("calibration/calibration.png").shape[1] == 600, "three images"
+    Path("dark/2.png").unlink()
+    run("calibrate dark --circle 60,48,40 --overwrite", says="from --circle")
+
+
+def test_a_flat_disc_is_no_ball(run):
+    """A lamp's image keeps its shape on a disc. A ball as evenly bright shortens it."""
+    y, x = np.indices((240, 240)) - 119.5
+    inside = np.hypot(x, y) < 90
+    n = np.stack((x, -y, np.sqrt(np.where(inside, 90.0**2 - x * x - y * y, 0))), axis=-1) / 90
+    for name in ("disc", "ball"):
+        Path(name).mkdir()
+        for number, half in enumerate(halfway(LIGHTS[1:])):
+            flat = np.hypot(x / 90 - half[0], y / 90 + half[1])
+            angle = np.arccos((n @ half).clip(-1, 1)) if name == "ball" else flat
+            spot = np.exp(-((angle / 0.09) ** 2))
+            picture = np.where(inside, 0.1 + 0.7 * spot, 0.02)
+            write_image(Path(name) / f"{number}.png", to_uint16(picture * 65535))
+    run("calibrate disc -o disc_lights", code=3, says="as on a flat disc. disc_lights/calibration")
+    assert [path.name for path in Path("disc_lights").iterdir()] == ["calibration.png"]
+    run("calibrate disc -o disc_lights --circle 119.5,119.5,90 --overwrite", says="from --circle")
+    run("calibrate ball -o ball_lights", says="from picture")
+    found = read_light_directions("ball_lights/light_directions.txt", 3)
+    assert angle_between_deg(found, LIGHTS[1:]).max() < 1
+
+
 def test_refusals(refuse):
     write_balls("ball")
     write_balls("short", LIGHTS[:3])
     write_balls("flat", wall=0.02)
-    write_balls("dark", LIGHTS[:1])
-    write_image("dark/1.png", np.full(SIZE, 900, np.uint16))
     write_balls("cut")
     for path in Path("cut").iterdir():
         write_image(path, read_image(path)[:, 35:])
@@ -178,7 +221,6 @@ def test_refusals(refuse):
         3 ball --mask nothing/0.pgm
         3 flat
         3 cut
-        3 dark --circle 60,48,40
         3 ball --circle 600,480,40
         3 ball short --circle 60,48,40 --circle 60,48,40
         3 ball --mask missing.png

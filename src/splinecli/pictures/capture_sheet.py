@@ -127,12 +127,13 @@ def _sample(mask: Bools, step: int) -> tuple[NDArray[np.intp], Bools]:
 
 def _shortened(names: Sequence[str]) -> list[str]:
     """Return the names without their common start and suffix if one does not fit its label."""
-    start, room = os.path.commonprefix(names), (_SIDE - _BESIDE) // _LETTER
+    start = os.path.commonprefix(names)  # noqa: RUF071 - by characters
+    room = (_SIDE - _BESIDE) // _LETTER
     labels = [_lines(f"{len(names)} {name}", room, break_words=False) for name in names]
     if start in names or all(len(max(ls, key=len)) <= room and len(ls) <= 2 for ls in labels):
         return list(names)
-    end = os.path.commonprefix([PurePath(name).suffix[::-1] for name in names])[::-1]
-    end = end if end.startswith(".") else ""
+    ends = {PurePath(name).suffix for name in names}
+    end = ends.pop() if len(ends) == 1 else ""
     return [f"...{name.removeprefix(start).removesuffix(end)}" for name in names]
 
 

@@ -322,27 +322,24 @@ def calibration_picture(balls: Sequence[BallCalibration]) -> bytes:
 
     The green circle is the outline, and the red one the highlight. The red line from the centre to
     the highlight points towards the lamp. The title contains the number of the image, from 1, and
-    the light direction x, y, z.
+    the light direction x, y, z. Images whose highlights were not found show the outline only.
     """
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle
 
-    columns = min(6, max(len(ball.directions) for ball in balls))
-    places = [-(-len(ball.directions) // columns) for ball in balls]
+    columns = min(6, max(len(ball.files.images) for ball in balls))
+    places = [-(-len(ball.files.images) // columns) for ball in balls]
     figure = Figure(figsize=(2 * columns, 2.25 * sum(places)), layout="constrained")
     grid = figure.subplots(sum(places), columns, squeeze=False)
     for axis in grid.flat:
         axis.set_axis_off()
     for first, ball in zip(np.cumsum([0, *places]), balls, strict=False):
-        for number, (x, y, z) in enumerate(ball.directions):
-            axis, circle, highlight = (
-                grid[first:].flat[number],
-                ball.circle,
-                ball.highlights[number],
-            )
+        circle = ball.circle
+        for number, path in enumerate(ball.files.images):
+            axis = grid[first:].flat[number]
             reach = 1.15 * circle.radius
             left, top = max(0, int(circle.x - reach)), max(0, int(circle.y - reach))
-            image = read_image(ball.files.images[number])
+            image = read_image(path)
             image = image[top : int(circle.y + reach) + 2, left : int(circle.x + reach) + 2]
             gray = image.mean(axis=2) ** 0.4  # so that the outline of a dark ball shows
             height, width = gray.shape
@@ -351,10 +348,14 @@ def calibration_picture(balls: Sequence[BallCalibration]) -> bytes:
             axis.set_xlim(circle.x - reach, circle.x + reach)
             axis.set_ylim(circle.y + reach, circle.y - reach)
             axis.add_patch(Circle((circle.x, circle.y), circle.radius, fill=False, color="#5AC85A"))
-            x_line, y_line, red = [circle.x, highlight.x], [circle.y, highlight.y], "#FF3C3C"
-            axis.plot(x_line, y_line, color=red, linewidth=1)
-            axis.plot(highlight.x, highlight.y, "o", color=red, markersize=6, fillstyle="none")
-            axis.set_title(f"{number + 1}:  {x:+.2f} {y:+.2f} {z:+.2f}", fontsize=_SMALL)
+            title = f"{number + 1}"
+            if number < len(ball.highlights):
+                highlight, (x, y, z) = ball.highlights[number], ball.directions[number]
+                x_line, y_line, red = [circle.x, highlight.x], [circle.y, highlight.y], "#FF3C3C"
+                axis.plot(x_line, y_line, color=red, linewidth=1)
+                axis.plot(highlight.x, highlight.y, "o", color=red, markersize=6, fillstyle="none")
+                title += f":  {x:+.2f} {y:+.2f} {z:+.2f}"
+            axis.set_title(title, fontsize=_SMALL)
     return png_bytes(figure, 100)
 
 

@@ -3,7 +3,6 @@ report.
 """
 
 import json
-from collections.abc import Sequence
 from typing import Any
 
 from splinecli.capture.channel_lights import CROSSTALK
@@ -14,6 +13,7 @@ from splinecli.lights.calibration.balls import (
     BallCalibration,
     BallFiles,
     CalibratedLights,
+    NoHighlightError,
     calibrate_ball,
     combine_balls,
     find_ball_files,
@@ -33,7 +33,7 @@ from splinecli.pictures.plots import calibration_picture
 from splinecli.pipeline.options import CalibrateOptions
 from splinecli.records.output_files import CALIBRATION
 from splinecli.system.files import check_free
-from splinecli.system.progress import SILENT, Observer
+from splinecli.system.progress import SILENT, Observer, Progress
 from splinecli.system.publishing import held_folder, new_files
 
 DIRECTIONS, INTENSITIES = "light_directions.txt", "light_intensities.txt"
@@ -59,10 +59,9 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
         circles: list[Circle | None] = [Circle(*numbers) for numbers in options.circles]
         with observer.progress("calibrating", sum(len(ball.images) for ball in balls)) as advance:
             calibrated = [
-                calibrate_ball(ball, circle, options.camera_matrix, advance)
+                _calibrate(ball, circle, options, advance)
                 for ball, circle in zip(balls, circles or [None] * len(balls), strict=True)
             ]
-        _check_outlines(calibrated, options)
         lights = combine_balls(calibrated)
         intensities = crosstalk = None
         warnings: list[str] = []
@@ -117,21 +116,36 @@ def _find_files(
     return balls, target_files
 
 
-def _check_outlines(balls: Sequence[BallCalibration], options: CalibrateOptions) -> None:
-    """Write the picture and raise InputError if an outline may not belong to a ball."""
-    for ball in balls:
+def _calibrate(
+    files: BallFiles, circle: Circle | None, options: CalibrateOptions, progress: Progress
+) -> BallCalibration:
+    """Return the lights of one ball.
+
+    If a highlight is not found, or the outline may not belong to a ball, write the picture and
+    raise InputError.
+    """
+    where, way_out = options.output / PICTURE, "and add --overwrite"
+    other = f"Give the ball's circle with --circle X,Y,R, or a mask with --mask FILE, {way_out}"
+    try:
+        ball = calibrate_ball(files, circle, options.camera_matrix, progress)
         if ball.doubt is None:
-            continue
-        with new_files(options.output, report=None) as new:
-            new.write(PICTURE, calibration_picture([ball]))
-        circle = ball.circle
-        raise InputError(
-            f"the circle in the images (centre {circle.x:.0f}, {circle.y:.0f}, radius"
-            f" {circle.radius:.0f} pixels) may not be the ball's edge: {ball.doubt}",
-            ball.files.folder,
-            hint=f"{options.output / PICTURE} shows it. Give the ball's circle with --circle X,Y,R,"
-            " or a mask with --mask FILE, and add --overwrite",
+            return ball
+        outline = ball.circle
+        refusal = InputError(
+            f"the circle in the images (centre {outline.x:.0f}, {outline.y:.0f}, radius"
+            f" {outline.radius:.0f} pixels) may not be the ball's edge: {ball.doubt}",
+            files.folder,
+            hint=f"{where} shows it. {other}",
         )
+    except NoHighlightError as error:
+        ball = error.ball
+        hint = f"{where} shows the circle that was searched. {error.hint}, {way_out}"
+        if ball.circle_from == "picture":
+            hint += f". If the circle is wrong, {other[0].lower()}{other[1:]}"
+        refusal = InputError(error.problem, error.path, hint=hint)
+    with new_files(options.output, report=None) as new:
+        new.write(PICTURE, calibration_picture([ball]))
+    raise refusal
 
 
 def _measure_target(

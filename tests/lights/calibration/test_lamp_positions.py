@@ -116,7 +116,7 @@ def photographed(rng, camera, source, *, height=0.0):
         radius = float(np.hypot(*(outline - (x, y)).T).mean())
         outline += (outline - (x, y)) * (0.3 * rng.normal() / radius) + 0.3 * rng.normal(size=2)
         circle = Circle(float(x), float(y), radius, points=outline)
-        marks = tuple(Highlight(*point, 0.0) for point in highlights.tolist())  # type: ignore[call-arg]
+        marks = tuple(Highlight(*point, 0.0, np.eye(2)) for point in highlights.tolist())  # type: ignore[call-arg]
         files = BallFiles(Path("ball"), (), None, None)
         balls.append(
             BallCalibration(files, circle, "--circle", marks, towards, normals, view, PIXELS)
@@ -195,7 +195,7 @@ def turned(directions, degrees):
 
 def ball(directions):
     files = BallFiles(Path("ball"), (Path("ball/1.png"),) * len(directions), None, None)
-    highlights = tuple(Highlight(1.23456, 2.0, 0.25) for _ in directions)
+    highlights = tuple(Highlight(1.23456, 2.0, 0.25, np.eye(2)) for _ in directions)
     normals = unit(directions + np.array((0, 0, 1)))
     view = View(np.eye(3), "assumed distant", 1.0)
     return BallCalibration(

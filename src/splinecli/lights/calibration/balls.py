@@ -8,7 +8,7 @@ the unit of length is the radius of the ball; x right, y up, z towards the camer
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ from splinecli.lights.calibration.circle import (
 from splinecli.maths import Array, Float32Array, Float64Array
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.pixel_grid import ray_basis
+from splinecli.maths.transfer import TransferCurve, decode_transfer
 from splinecli.records.capture_warnings import CaptureWarning
 from splinecli.system.progress import Progress, ignore
 
@@ -123,24 +124,36 @@ class Highlight:
     x: float  # position of the centroid, in pixels of the image
     y: float
     saturated: float  # share of saturated pixels, 0 to 1
+    # (2, 2), the covariance of x and y over its patch, in square pixels
+    shape: Float64Array = field(repr=False, compare=False)
 
 
-def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = None) -> Highlight:
+def find_highlight(
+    image: Array,
+    circle: Circle,
+    *,
+    full_scale: float | None = None,
+    curve: TransferCurve = 1.0,
+) -> Highlight:
     """Return the highlight of the lamp in the ball, located at the centroid of its brightest patch.
 
     Raises InputError if the ball shows no highlight, or if its brightest patch is too wide for a
     lamp.
 
     Args:
-        image: (H, W), linear gray values.
+        image: (H, W), stored gray values.
+        curve: their transfer curve. It is reversed to compare the highlight with the rest of the
+            ball.
         full_scale: the value at which pixels saturate. None for images that do not saturate.
     """
     inside = circle.inside(image.shape)
     values = np.where(inside, image, 0).astype(np.float32)
     # The blur removes single bright pixels, which are dust or noise.
     smooth = cv2.GaussianBlur(values, (0, 0), max(0.8, circle.radius / 200)) * inside
-    brightest, median = float(smooth.max()), float(np.median(values[inside]))
-    if brightest <= 4.0 * median or brightest <= 0:
+    brightest = float(smooth.max())
+    levels = np.array((brightest, np.median(values[inside])), np.float32)
+    lamp, median = decode_transfer(levels, curve)
+    if lamp <= 4.0 * median or lamp <= 0:
         raise InputError(
             "found no highlight in the ball",
             hint="If these are images of a mirror ball, take them with all other lights off, so"
@@ -162,7 +175,8 @@ def find_highlight(image: Array, circle: Circle, *, full_scale: float | None = N
     weight = smooth[core].astype(np.float64) - 0.9 * _HIGHLIGHT_LEVEL * brightest
     saturated = float((values[core] >= full_scale).mean()) if full_scale is not None else 0.0
     x_centre, y_centre = (float(np.average(axis, weights=weight)) for axis in (x, y))
-    return Highlight(x_centre, y_centre, saturated)
+    shape = np.cov(x, y, ddof=0, aweights=weight)
+    return Highlight(x_centre, y_centre, saturated, shape)
 
 
 def ball_centre(outline: Float64Array, matrix: Float64Array) -> Float64Array:
@@ -238,6 +252,14 @@ class BallCalibration:
         return np.array([(highlight.x, highlight.y) for highlight in self.highlights])
 
 
+class NoHighlightError(InputError):
+    """An image of a ball has no usable highlight. `ball` has those of the images before it."""
+
+    def __init__(self, error: InputError, path: Path, ball: BallCalibration) -> None:
+        super().__init__(error.problem, path=path, hint=error.hint)
+        self.ball = ball
+
+
 @dataclass(frozen=True, eq=False)
 class CalibratedLights:
     """The light directions from one or more balls."""
@@ -285,45 +307,58 @@ def calibrate_ball(
             (see find_view).
 
     Raises:
-        InputError: an image cannot be read, has another size or shows no highlight; or the outline
-            is not found or not entirely inside the image.
+        NoHighlightError: an image shows no highlight of a lamp in front of the ball.
+        InputError: an image cannot be read or has another size; or the outline is not found or not
+            entirely inside the image.
     """
     circles, circle_from = _find_outline(files) if circle is None else ([circle], "--circle")
     circle = circles[0]
     view = find_view(files.facts[0], camera_matrix)
     centre = ball_centre(circle.outline, view.matrix)
-    highlights, normals, directions, n_agreeing = [], [], [], 0
+    highlights: list[Highlight] = []
+    normals, directions = np.empty((2, len(files.images), 3))
+    n_agreeing = n_uniform = 0
     shape = files.facts[0].size[0][:2]
-    for path in files.images:
+
+    def result(doubt: str | None = None) -> BallCalibration:
+        n = len(highlights)
+        found = (tuple(highlights), directions[:n], normals[:n])
+        return BallCalibration(files, circle, circle_from, *found, view, shape, doubt)
+
+    for number, (path, facts) in enumerate(zip(files.images, files.facts, strict=True)):
         stored = decode_image(path, ExpectedSize(shape, files.images[0].name))
         if not circle.inside(shape).any():
             raise InputError(
                 "the circle is outside the image", path=path, hint="Give --circle X,Y,R in pixels"
             )
+        full_scale = 1.0 if stored.dtype.kind == "u" else None
+        gray = to_linear(stored, path).mean(axis=2)
         try:
-            full_scale = 1.0 if stored.dtype.kind == "u" else None
-            gray = to_linear(stored, path).mean(axis=2)
-            highlight = find_highlight(gray, circle, full_scale=full_scale)
-            n_agreeing += circle_from == "picture" and is_in(gray, circle)
+            highlight = find_highlight(gray, circle, full_scale=full_scale, curve=facts.curve.curve)
             point = np.array([(highlight.x, highlight.y)])
-            normal, direction = reflect(centre, point, view.matrix)
-            if not direction[0] @ unit_rays(point, view.matrix)[0] < 0:
+            normals[[number]], directions[[number]] = reflect(centre, point, view.matrix)
+            if not directions[number] @ unit_rays(point, view.matrix)[0] < 0:
                 raise InputError(
                     "the highlight is near the rim of the ball, so the lamp is level with the ball"
                     " or behind it",
                     hint="Place all lights on the camera's side of the object",
                 )
         except InputError as error:
-            raise InputError(error.problem, path=path, hint=error.hint) from None
+            raise NoHighlightError(error, path, result()) from None
+        if circle_from == "picture":
+            n_agreeing += is_in(gray, circle)
+            n_uniform += _is_uniform(gray, circle)
         highlights.append(highlight)
-        normals.append(normal[0])
-        directions.append(direction[0])
         progress(1)
-    found = (tuple(highlights), np.array(directions), np.array(normals))
-    doubt = None
-    if circle_from == "picture":
-        doubt = _doubt(circles, np.array([(each.x, each.y) for each in highlights]), n_agreeing)
-    return BallCalibration(files, circle, circle_from, *found, view, shape, doubt)
+    if circle_from != "picture":
+        return result()
+    doubt = _doubt(circles, result().points, n_agreeing)
+    if doubt is None and 2 * n_uniform > len(highlights) and _keep_shape(highlights, circle):
+        doubt = (
+            "it is evenly bright, and the highlight is as round near the edge as in the middle, as"
+            " on a flat disc"
+        )
+    return result(doubt)
 
 
 _LEAST_VISIBLE = 0.6  # share of the outline of a ball that is found in a picture
@@ -354,6 +389,50 @@ def _doubt(circles: Sequence[Circle], highlights: Float64Array, n_agreeing: int)
     if n_images > 2 and np.median(moved) < _LEAST_MOTION * ball.radius:
         return "the highlight does not move in most images"
     return None
+
+
+# Interquartile range of the brightness of a uniform disc, relative to the median; above 1 in
+# photographs of mirror balls, which reflect the room
+_UNIFORM = 0.1
+_FORESHORTENED = 0.25  # share of a mirror ball's foreshortening below which highlights have none
+# smallest rms logarithm of the foreshortening, and width (standard deviation in pixels), at which
+# it is measured
+_MEASURABLE, _LEAST_WIDTH = 0.05, 2.0
+
+
+def _is_uniform(image: Array, circle: Circle) -> bool:
+    """Return whether a circle inside an image (H, W) is evenly bright, except for highlights."""
+    across, half = (np.arange(32) - 15.5) / 16, math.ceil(circle.radius)
+    left, top = max(0, round(circle.x) - half), max(0, round(circle.y) - half)
+    cut = image[top : top + 2 * half + 1, left : left + 2 * half + 1].astype(np.float32)
+    values = cv2.resize(cut, (32, 32), interpolation=cv2.INTER_AREA)
+    quarter, median, other = np.quantile(
+        values[np.hypot(across, across[:, None]) < 0.9], (0.25, 0.5, 0.75)
+    )
+    return bool(other - quarter < _UNIFORM * median)
+
+
+def _keep_shape(highlights: Sequence[Highlight], circle: Circle) -> bool:
+    """Return whether highlights keep their shape towards the edge, as on a flat disc.
+
+    At a distance of r radii from the middle, a mirror ball foreshortens the image of a lamp by
+    1 - r^2 along the radius, relative to its width; a brushed one, by the square root. False if the
+    highlights are too small or too close to the middle for this to be measured.
+    """
+    from_middle = np.array([(each.x, each.y) for each in highlights]) - (circle.x, circle.y)
+    distance = np.hypot(*from_middle.T)
+    along = from_middle / np.maximum(distance, 1e-9)[:, None]
+    across = along[:, ::-1] * (1, -1)
+    shapes = np.array([each.shape for each in highlights])
+    length, width = (
+        np.sqrt(np.maximum(np.einsum("fi,fij,fj->f", axis, shapes, axis), 1e-9))
+        for axis in (along, across)
+    )
+    expected = np.log(1 - np.square(distance / circle.radius).clip(0, 0.99))
+    power = float(np.square(expected).mean())
+    found = float((expected * np.log(length / width)).mean())
+    measurable = math.sqrt(power) > _MEASURABLE and float(np.median(width)) > _LEAST_WIDTH
+    return measurable and found < _FORESHORTENED * power
 
 
 def combine_balls(balls: Sequence[BallCalibration]) -> CalibratedLights:
