@@ -2,6 +2,8 @@
 
 import base64
 import json
+import re
+import shutil
 from pathlib import Path
 
 import cv2
@@ -10,7 +12,7 @@ import pytest
 
 from capture.formats.test_film import path_of_lamp, sphere_film, write_film
 from cli.test_schema import check
-from scenes import cap_directions, codes, put, shade, sphere, write_capture, write_image
+from scenes import cap_directions, codes, put, read_image, shade, sphere, write_capture, write_image
 from splinecli.maths.normals import angle_between_deg
 
 LIGHTS = cap_directions(10, 50, 4, even=True)
@@ -65,6 +67,20 @@ def test_lights_are_estimated_if_there_is_no_light_file(unlit, run, document):
         image.unlink()
     run(f"infer {unlit} -o other", input_error="5 images")
     assert not Path("other").exists()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_batch_gives_its_advice_once(unlit, run, workers):
+    """Of the second capture, only what differs is said."""
+    image = sorted(unlit.glob("*[0-9].png"))[3]
+    write_image(image, read_image(image) // 2)
+    shutil.copytree(unlit, "other")
+    err = run(f"infer {unlit} other --method ls --workers {workers}").err
+    for advice in ("add --lights FILE", "Use --intensities FILE if you have measured them"):
+        assert err.count(advice) == 1, err
+    for found in ("directions were .*[0-9] degrees on average", "intensities were .* times their"):
+        names = re.findall(f"warning: (ball|other): The light {found}", err)
+        assert sorted(names) == ["ball", "other"]
 
 
 def test_a_light_file_of_the_user_is_kept(unlit, run):

@@ -153,8 +153,10 @@ class Messages(Observer):
         if not self.quiet:
             print(printable(message), file=sys.stderr)
 
-    def warn(self, message: str, *, once: str | None = None) -> None:
-        if once is None or once not in self._warned:
+    def warn(self, message: str, *, once: str | None = None, again: str = "") -> None:
+        if once is not None and once in self._warned:
+            message = again
+        if message:
             self.say(f"splinecli: warning: {message}")
         self._warned.add(once)
 

@@ -372,8 +372,8 @@ def _on_workers(
             outcome, warnings = (
                 (failed(member.name, result), []) if isinstance(result, LostError) else result
             )
-            for warning in warnings:
-                observer.warn(warning)
+            for message, once, again in warnings:
+                observer.warn(message, once=once, again=again)
             n_failed += outcome.exit_code != 0
             n_pixels += outcome.report["n_pixels"] if outcome.status == "done" else 0
             speed = n_pixels / (time.monotonic() - began)
@@ -386,15 +386,15 @@ class _Warnings(Observer):
     """Collects warnings, which are returned with the report."""
 
     def __init__(self) -> None:
-        self.found: list[str] = []
+        self.found: list[tuple[str, str | None, str]] = []
 
-    def warn(self, message: str, *, once: str | None = None) -> None:
-        self.found.append(message)
+    def warn(self, message: str, *, once: str | None = None, again: str = "") -> None:
+        self.found.append((message, once, again))
 
 
 def _infer(
     options: InferOptions, redo: Redo, sha256: str | None, number: int, member: BatchItem
-) -> tuple[Outcome, list[str]]:
+) -> tuple[Outcome, list[tuple[str, str | None, str]]]:
     options.check_files()
     estimator = _method(options, options.method_options, sha256)
     if member.missing is None and not os.path.lexists(member.folder):

@@ -327,9 +327,11 @@ def infer_capture(
         estimate, distilled, work = estimate_capture(work, load, distil=options.distil, clock=clock)
         source, capture = work.files, work.made
         for warning in estimate.capture.warnings:
-            # In a batch, this warning usually applies to all captures.
+            # In a batch, these warnings usually apply to all captures.
             once = warning.text if warning.kind is EIGHT_BIT else None
-            observer.warn(f"{capture.name}: {warning}", once=once)
+            again = f"{capture.name}: {warning.again}" if warning.again else ""
+            once = warning.code if again else once
+            observer.warn(f"{capture.name}: {warning}", once=once, again=again)
         estimator = load()
         loaded = None if estimator.weights is None else estimator.weights["sha256"]
         report = report_of(

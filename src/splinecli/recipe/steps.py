@@ -203,16 +203,18 @@ def divide_by_intensities(work: Work, _: Callable[[], object]) -> Work:
         return work
     lowest, highest = intensities.min(), intensities.max()
     digits = 4 if f"{lowest:.2f}" == f"{highest:.2f}" else 2
+    extent = f"from {lowest:.{digits}f} to {highest:.{digits}f} times their mean."
     text = (
-        "The light intensities were estimated from the images: they are unequal, from"
-        f" {lowest:.{digits}f} to {highest:.{digits}f} times their mean. Use --intensities FILE if"
-        " you have measured them, or --intensities equal to assume equal ones."
+        f"The light intensities were estimated from the images: they are unequal, {extent} Use"
+        " --intensities FILE if you have measured them, or --intensities equal to assume equal"
+        " ones."
     )
+    again = f"The light intensities were estimated: {extent}"
     capture = replace(
         capture,
         observations=np.divide(capture.observations, intensities, dtype=np.float32),
         estimated_intensities=intensities,
-        warnings=(*capture.warnings, CaptureWarning(ESTIMATED_INTENSITIES, text)),
+        warnings=(*capture.warnings, CaptureWarning(ESTIMATED_INTENSITIES, text, again=again)),
     )
     return replace(work, capture=capture)
 

@@ -39,11 +39,14 @@ class CaptureWarning:
     error_deg: the median angular error of the normals in degrees if the warning is correct. The
         confidence is lowered accordingly. None if the normals are not affected, or the confidence
         accounts for the fault in another way.
+    again: the part of the text that differs between captures, for the second one in a batch and
+        later ones. Empty if the whole text is repeated.
     """
 
     kind: WarningKind
     text: str
     error_deg: float | None = None
+    again: str = ""
 
     @property
     def code(self) -> str:
@@ -410,9 +413,13 @@ def estimated_lights(errors_deg: Float64Array, *, requested: bool) -> CaptureWar
     if not requested:
         why = ", because the capture has no light file"
         way_out = " If you have measured the lights, add --lights FILE."
+    expected = (
+        f"Their expected error is {errors_deg.mean():.0f} degrees on average and"
+        f" {errors_deg.max():.0f} degrees for the worst one"
+    )
     return CaptureWarning(
         ESTIMATED_LIGHTS,
-        f"The light directions were estimated from the images{why}. Their expected error is"
-        f" {errors_deg.mean():.0f} degrees on average and {errors_deg.max():.0f} degrees for the"
-        f" worst one; the normals inherit these errors.{way_out}",
+        f"The light directions were estimated from the images{why}. {expected}; the normals inherit"
+        f" these errors.{way_out}",
+        again=f"The light directions were estimated. {expected}.",
     )

@@ -107,10 +107,11 @@ class Observer:
     def say(self, message: str) -> None:
         """Receive a message for the user."""
 
-    def warn(self, message: str, *, once: str | None = None) -> None:
+    def warn(self, message: str, *, once: str | None = None, again: str = "") -> None:
         """Receive a warning: the results may be worse than they could be.
 
-        Of several warnings with the same word `once`, the first one is enough.
+        Of several warnings with the same word `once`, the first one is enough; `again` is what the
+        later ones add to it.
         """
 
     def error(self, message: str) -> None:
