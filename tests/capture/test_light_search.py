@@ -23,6 +23,7 @@ from capture.conftest import (
 )
 from scenes import codes, parametrize, pinhole, put, refuses, write_image
 from splinecli.capture import find_captures, open_capture
+from splinecli.capture.light_search import NoLightsError
 from splinecli.capture.lights_in_names import lights_in_names
 from splinecli.maths.normals import unit
 from splinecli.recipe import prepare_capture
@@ -85,6 +86,26 @@ def test_files_that_do_not_fit_or_differ(tmp_path):
     put(folder / "Lights/b.txt", "\n".join(LINES.splitlines()[::-1]))
     with refuses(r"2 files that fit the images: a\.txt, b\.txt"):
         open_capture(folder)
+
+
+@pytest.mark.parametrize("name", ["Lights/light_directions.txt", "my_lights.txt", "cat_lights.csv"])
+@pytest.mark.parametrize(
+    ("text", "says"), [("1 a 2\n", "expected a number"), (LINES[: LINES.rindex("\n")], "found 7")]
+)
+def test_nothing_is_estimated_beside_wrong_lights(tmp_path, name, text, says):
+    scenes.write_capture(tmp_path, pictures(), None)
+    put(tmp_path / name, text)
+    with refuses(says) as error:
+        open_capture(tmp_path)
+    assert error.value.path == tmp_path / name
+    assert not isinstance(error.value, NoLightsError)
+
+
+def test_other_tables_in_the_folder_above(tmp_path):
+    scenes.write_capture(tmp_path / "owl", pictures(), None)
+    put(tmp_path / "outside.csv", PLACES["Lights/lights.csv"])
+    with pytest.raises(NoLightsError):
+        open_capture(tmp_path / "owl")
 
 
 OBJECTS = {

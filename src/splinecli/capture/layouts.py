@@ -336,9 +336,10 @@ def _no_lights(folder: Path, images: Sequence[Path]) -> InputError:
     """Return the error for a capture without a light file, with a hint about the options for
     reading it.
 
-    If the lights can be estimated from the images, the error is a NoLightsError.
+    If the lights can be estimated from the images, the error is a NoLightsError. Raises InputError
+    if a file of lights does not fit the images.
     """
-    option = light_option([folder, images[0].parent, _parent(folder)], images)
+    option = light_option(folder, images)
     count = "1 image" if len(images) == 1 else f"{len(images)} images"
     problem = f"found {count} ({files.short_list(images)}) but no light file"
     if len(images) < MIN_LIGHTS:

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from fnmatch import fnmatchcase
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 
 import numpy as np
@@ -190,17 +190,23 @@ def _fit(
     return None
 
 
-def light_option(folders: Sequence[Path], images: Sequence[Path]) -> str | None:
-    """Return the options for reading a file in one of the folders as lights; None if no file
-    fits.
+def light_option(folder: Path, images: Sequence[Path]) -> str | None:
+    """Return the options for reading a file as lights: any in the folder or beside the images, or
+    one with a name of lights in another place. None if no file fits.
+
+    Raises InputError with the reason if a file of the capture with a name of lights does not fit.
     """
-    for folder in folders:
-        with suppress(InputError, OSError):
-            for path in _candidates(folder):
-                is_slant = re.search("slant|tilt", path.name.lower())
-                angles: RowForm = "slant-tilt" if is_slant else "azel"
-                for form in ("xyz", angles):
-                    if _fit(path, images, form, by_order=True) is not None:
-                        option = f"--lights {path}"
-                        return option if form == "xyz" else f"{option} --light-format {form}"
+    near = dict.fromkeys((folder, images[0].parent))
+    named, *others = _places(folder, images[0].parent)
+    candidates = [path for each in near for path in _candidates(each)]
+    for path in dict.fromkeys(chain(candidates, *others)):
+        is_slant = re.search("slant|tilt", path.name.lower())
+        angles: RowForm = "slant-tilt" if is_slant else "azel"
+        for form in ("xyz", angles):
+            if _fit(path, images, form, by_order=True) is not None:
+                option = f"--lights {path}"
+                return option if form == "xyz" else f"{option} --light-format {form}"
+    inside = [path for each in near for of in light_folders(each) for path in _candidates(of)]
+    for path in (*named, *inside):
+        read_lights(path, len(images))
     return None
