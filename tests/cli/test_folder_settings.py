@@ -34,6 +34,22 @@ def test_written_settings_are_read(unusual, run, document):
     assert other["light_directions"] != expected["light_directions"]
 
 
+@pytest.mark.parametrize("options", ["--lights estimate", "--light-positions {}/positions.txt"])
+def test_options_that_conflict_with_settings_win(unusual, run, options):
+    text = 'lights = "lamps.dat"\nmask = "mask.png"\nlight-frame = "y-down"\n'
+    (unusual / "splinecli.toml").write_text(text)
+    positions = 100 * np.loadtxt(unusual / "lamps.dat") * (1, -1, 1)
+    np.savetxt(unusual / "positions.txt", positions)
+    (unusual / "pixel_size.txt").write_text("1")
+    run(f"info {unusual} {options.format(unusual)}")
+
+
+def test_conflicts_with_settings_name_the_file(unusual, run):
+    (unusual / "splinecli.toml").write_text('lights = "estimate"\nfirst-light = "left"\n')
+    lights = f"--lights {unusual}/lamps.dat"
+    run(f"info {unusual} {lights}", code=2, says=("splinecli.toml", "first-light"))
+
+
 @parametrize(
     ("text", "says"),
     [
@@ -58,4 +74,11 @@ def test_settings_that_cannot_be_written(unusual, run):
     given = f"--lights {unusual}/lamps.dat"
     run(f"info {unusual} --write-settings", usage_error="needs options")
     assert not (unusual / "splinecli.toml").exists()
+    np.savetxt(unusual / "few.dat", np.eye(3))
+    for wrong in ("--lights {0}/few.dat", "--lights {0}/none.dat", "--white-level 1e9 " + given):
+        run(f"info {unusual} --write-settings {wrong.format(unusual)}", code=3)
+        assert not (unusual / "splinecli.toml").exists()
     run(f"info {unusual} {given} --light-frame y-down --write-settings")
+    run(f"info {unusual} {given} --write-settings", code=5, says="Add --overwrite")
+    run(f"info {unusual} {given} --write-settings --overwrite")
+    assert (unusual / "splinecli.toml").read_text() == 'lights = "lamps.dat"\n'

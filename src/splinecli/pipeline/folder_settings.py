@@ -91,13 +91,23 @@ def with_settings(options: Options, folder: Path, kind: type[records.Record]) ->
 
     Raises InputError, or UsageError if options conflict.
     """
-    default = {field.name: field.default for field in fields(options)}
-    given = {name for name in default if getattr(options, name) != default[name]}
-    for pair in options.CONFLICTS:  # settings that conflict with a given option are ignored
-        given |= set(pair[:2]) if given & set(pair[:2]) else set()
+    settings = read_settings(folder, kind)
+    if not settings:
+        return options
     taken = {
         name: value
-        for name, value in read_settings(folder, kind).items()
-        if name in default and name not in given
+        for name, value in settings.items()
+        if name in options.__struct_fields__ and not options.has(name)
     }
-    return options.replace(**taken) if taken else options
+    of_folder = kind(**settings)
+    for first, second, _ in options.CONFLICTS:  # the options given take precedence
+        for one, other in ((first, second), (second, first)):
+            name = other.partition("=")[0]
+            if name in settings and options.has(one) and of_folder.has(other):
+                taken.pop(name, None)
+    try:
+        return options.replace(**taken)
+    except UsageError as error:
+        hint = f"{error.hint}. " if error.hint else ""
+        hint += f"{SETTINGS} sets {', '.join(key.replace('_', '-') for key in taken)}"
+        raise UsageError(error.problem, folder / SETTINGS, hint=hint) from None

@@ -321,32 +321,20 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
         ("lights_in_channels", "align", LEAVE_ONE),
         ("light_positions", "light_distance", LEAVE_ONE),
         ("pixel_size", "object_width", LEAVE_ONE),
+        *(
+            (f"lights={ESTIMATE}", name, "Leave one out, or pass a light file")
+            for name in ("light_positions", "light_distance", "light_frame", "light_format")
+        ),
+        ("lights", "light_positions", LEAVE_ONE),
+        ("align", "scale", "Leave one out, or use --crop for a first look"),
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        # These options apply to near lamps or to a light file.
-        near, of_file = "finds distant lights", "does not use a light file"
-        for name, given, reason in (
-            ("--light-positions", self.light_positions is not None, near),
-            ("--light-distance", self.light_distance is not None, near),
-            ("--light-frame", self.light_frame is not None, of_file),
-            ("--light-format", self.light_format != "xyz", of_file),
-        ):
-            if self.finds_lights and given:
-                raise UsageError(
-                    f"--lights estimate {reason}, so it cannot be used with {name}",
-                    hint=f"Leave {name} out, or pass a light file",
-                )
         add_it = "Add {}, or leave both out"
         if self.crosstalk is not None and not self.lights_in_channels:
             hint = add_it.format("--lights-in-channels")
             raise UsageError("--crosstalk needs --lights-in-channels", hint=hint)
-        if self.align and self.scale is not None:
-            raise UsageError(
-                "--align needs every row and column, so it cannot be used with --scale",
-                hint="Leave one out, or use --crop for a first look",
-            )
         if self.first_light is not None:
             if not (self.finds_lights or self.may_find_lights):
                 hint = add_it.format("--lights estimate")

@@ -13,7 +13,7 @@ import numpy as np
 from splinecli.capture import CaptureSource
 from splinecli.capture.channel_lights import CHANNELS
 from splinecli.capture.light_files import encode_lights, light_encoder
-from splinecli.errors import UsageError
+from splinecli.errors import OutputError, UsageError
 from splinecli.judge.light_check import candidate_rows
 from splinecli.lights.calibration.balls import find_view
 from splinecli.pictures.capture_sheet import sheet_of
@@ -51,8 +51,7 @@ def describe_capture(
     reading, plot, mended_lights = reading or ReadingOptions(), options.plot, options.mended_lights
     with TemporaryDirectory() as frames:  # extracted from a video
         folder = unpacked(options.capture, Path(frames), reading, observer, redo="all")
-        if options.write_settings:
-            _write_settings(options, reading, folder)
+        settings = _settings(options, reading, folder) if options.write_settings else None
         auto_mask = options.auto_mask or bool(
             reading.mask is None and read_settings(folder, FolderSettings).get("auto_mask")
         )
@@ -69,6 +68,8 @@ def describe_capture(
             work = follow(work, advance=lambda amount, _: advance(amount))
         capture, judgement = work.made, work.judgement
         assert judgement is not None  # the recipe judges
+        if settings is not None:  # they have been shown to work
+            write_bytes(folder / SETTINGS, settings)
         if plot is not None:
             errors_deg = capture.light_errors_deg
             picture = sky_plot(capture.light_directions, capture.name, errors_deg=errors_deg)
@@ -196,8 +197,8 @@ def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
     ]
 
 
-def _write_settings(options: InfoOptions, reading: ReadingOptions, folder: Path) -> None:
-    """Write splinecli.toml into the folder of a capture.
+def _settings(options: InfoOptions, reading: ReadingOptions, folder: Path) -> bytes:
+    """Return the content of splinecli.toml for the folder of a capture.
 
     Raises UsageError if no option is given, an option names a file outside the folder, or the
     capture is a video; OutputError if the folder contains another splinecli.toml.
@@ -215,9 +216,10 @@ def _write_settings(options: InfoOptions, reading: ReadingOptions, folder: Path)
             hint="Add options for reading the capture, or leave --write-settings out",
         )
     path = folder / SETTINGS
-    if not (path.is_file() and path.read_text("utf-8") == text):
-        check_free(folder, [SETTINGS], overwrite=options.overwrite)
-        write_bytes(path, text.encode())
+    if path.exists() and not options.overwrite and path.read_bytes() != text.encode():
+        hint = "Add --overwrite to replace it, or change its lines"
+        raise OutputError("already exists with other settings", path, hint=hint)
+    return text.encode()
 
 
 def _check_options(options: InfoOptions, source: CaptureSource) -> None:

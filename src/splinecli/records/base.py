@@ -129,7 +129,10 @@ class Record(Struct, metaclass=_RecordMeta, frozen=True, kw_only=True, forbid_un
     """
 
     CONFLICTS: ClassVar[Conflicts] = ()
-    """Pairs of fields of which only one may differ from its default, each with a hint."""
+    """Pairs of fields of which only one may differ from its default, each with a hint.
+
+    In place of a field, NAME=VALUE stands for one with this value.
+    """
 
     def __post_init__(self) -> None:
         titles = {}
@@ -141,12 +144,19 @@ class Record(Struct, metaclass=_RecordMeta, frozen=True, kw_only=True, forbid_un
                 for item in value if option.items else ():
                     check_one_of(name.removesuffix("s"), item, option.items)
                 titles[name] = title
-        given = {field.name for field in fields(self) if getattr(self, field.name) != field.default}
-        for first, second, hint in self.CONFLICTS:
-            if first in given and second in given:
-                raise UsageError(
-                    f"{titles[first]} and {titles[second]} cannot be used together", hint=hint
+        for *pair, hint in self.CONFLICTS:
+            if all(map(self.has, pair)):
+                first, second = (
+                    " ".join([titles[name], *value])
+                    for name, *value in (e.split("=") for e in pair)
                 )
+                raise UsageError(f"{first} and {second} cannot be used together", hint=hint)
+
+    def has(self, given: str) -> bool:
+        """Return whether a field differs from its default, or for NAME=VALUE has this value."""
+        name, equals, value = given.partition("=")
+        default = {field.name: field.default for field in fields(self)}[name]
+        return bool(getattr(self, name) == value if equals else getattr(self, name) != default)
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with new values for some fields."""
