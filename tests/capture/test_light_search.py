@@ -7,6 +7,8 @@ import numpy as np
 from numpy.testing import assert_allclose
 from scipy.io import savemat
 
+import pytest
+
 import scenes
 from capture.conftest import (
     DISC,
@@ -106,6 +108,18 @@ def test_other_tables_in_the_folder_above(tmp_path):
     put(tmp_path / "outside.csv", PLACES["Lights/lights.csv"])
     with pytest.raises(NoLightsError):
         open_capture(tmp_path / "owl")
+
+
+def test_ways_out_that_work(tmp_path):
+    scenes.write_capture(tmp_path / "owl/photos", pictures(), None)
+    with refuses(r"no images\. Pass .*, such as .*photos\."):
+        open_capture(tmp_path / "owl")
+    scenes.write_capture(tmp_path / "one", pictures()[:1], None)
+    for rows, named in (("0 0 1\n", False), ("0 0 1\n0.5 0 1\n0 0.5 1\n", True)):
+        put(tmp_path / "one/output.txt", rows)
+        with refuses("") as error:
+            open_capture(tmp_path / "one")
+        assert ("output.txt" in str(error.value)) is named
 
 
 OBJECTS = {

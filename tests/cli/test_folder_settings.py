@@ -55,6 +55,7 @@ def test_conflicts_with_settings_name_the_file(unusual, run):
     [
         ("transfer = ", "is not valid TOML"),
         ("a = 1\n", ("toml:1:", "unknown setting 'a'", "light-frame")),
+        ("light_frame = 'y-down'\n", "Did you mean light-frame?"),
         ("\nwhite-level = 'high'", ("toml:2:", "white-level")),
         ("output = 'x'", "unknown setting 'output'"),
         ("lights = '../lights.txt'", "expected a path inside the folder"),
@@ -66,6 +67,12 @@ def test_wrong_settings(capture, run, text, says):
     for command in ("infer", "info"):
         run(f"{command} {capture}", input_error=("splinecli.toml", *np.atleast_1d(says)))
     assert not Path("out").exists()
+
+
+def test_settings_from_a_windows_editor(unusual, run):
+    text = "lights = 'lamps.dat'\nlight-frame = 'y-down'\nalign = true\n"
+    (unusual / "splinecli.toml").write_text(text, "utf-8-sig")
+    assert 'light-frame = "y-down", align = true' in run(f"info {unusual}").err.replace("\n", " ")
 
 
 def test_settings_that_cannot_be_written(unusual, run):

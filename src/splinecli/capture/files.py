@@ -166,6 +166,9 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
         )
         if films := list(filter(is_film, list_folder(folder))):
             hint = f"Pass the video itself, as in: splinecli infer {films[0]}"
+        inside = [path for path in list_folder(folder) if is_folder(path) and list_images(path)]
+        if inside:
+            hint = f"Pass the folder with the images, such as {inside[0]}"
         raise NoImagesError(
             "the folder contains no images" + (f", but {found}" if found else ""),
             folder,

@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from splinecli.capture import files
+from splinecli.capture.channel_lights import CHANNELS
 from splinecli.capture.formats.film import is_film
 from splinecli.capture.light_files import FORMATS, read_light_directions
 from splinecli.capture.light_search import (
@@ -339,16 +340,18 @@ def _no_lights(folder: Path, images: Sequence[Path]) -> InputError:
     If the lights can be estimated from the images, the error is a NoLightsError. Raises InputError
     if a file of lights does not fit the images.
     """
-    option = light_option(folder, images)
     count = "1 image" if len(images) == 1 else f"{len(images)} images"
     problem = f"found {count} ({files.short_list(images)}) but no light file"
     if len(images) < MIN_LIGHTS:
+        option = None
+        with suppress(InputError):  # a file with other numbers of lights is none for these images
+            option = light_option(folder, (*images,) * CHANNELS)
         hint = (
             "A normal needs at least three photographs under different lights; for a colour"
             f" photograph under three coloured lamps, add --lights-in-channels {option or ''}"
         )
         return InputError(problem, folder, hint=hint.rstrip())
-    if option:
+    if option := light_option(folder, images):
         return InputError(problem, folder, hint=f"Add {option}")
     hint = (
         "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' creates"

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from msgspec.structs import fields
 
 from splinecli.capture.files import find_named
-from splinecli.errors import InputError, UsageError
+from splinecli.errors import InputError, UsageError, did_you_mean
 from splinecli.records import base as records
 from splinecli.system.files import resolve
 
@@ -37,7 +37,7 @@ def read_settings(folder: Path, kind: type[records.Record]) -> dict[str, Any]:
         if (option := records.option_of(each)) is not None and option.panel != "Output"
     }
     try:
-        text = path.read_text("utf-8")
+        text = path.read_text("utf-8-sig")
         given = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         hint = "Write lines such as transfer = 'srgb', or remove the file"
@@ -48,7 +48,9 @@ def read_settings(folder: Path, kind: type[records.Record]) -> dict[str, Any]:
         line = names.index(key) + 1 if key in names else None
         fail = partial(InputError, path=path, line=line, hint=CORRECT)
         if key not in kinds:
-            raise fail(f"unknown setting {key!r}, expected one of {', '.join(sorted(kinds))}")
+            hint = did_you_mean(key.replace("_", "-"), kinds) or CORRECT
+            names_of = ", ".join(sorted(kinds))
+            raise fail(f"unknown setting {key!r}, expected one of {names_of}", hint=hint)
         try:
             one = records.converted(kinds[key], value, f"setting {key!r}", InputError)
         except InputError as error:

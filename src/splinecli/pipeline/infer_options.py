@@ -439,7 +439,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
                 hint="Add --lights estimate, or leave --first-light out",
             )
         taken = [
-            f"{name.replace('_', '-')} = {value}"
+            f"{name.replace('_', '-')} = {json.dumps(value)}"
             for name, value in read_settings(folder, FolderSettings).items()
             if getattr(self, name, None) == value
         ]
