@@ -55,7 +55,8 @@ def describe_capture(
         auto_mask = options.auto_mask or bool(
             reading.mask is None and read_settings(folder, FolderSettings).get("auto_mask")
         )
-        reading = reading.with_settings(folder)
+        if settings is None:  # otherwise, those to be written replace them
+            reading = reading.with_settings(folder)
         source = reading.open(folder)
         _check_options(options, source)
         work = begin(
