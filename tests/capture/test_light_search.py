@@ -23,7 +23,7 @@ from capture.conftest import (
     xyz,
 )
 from scenes import codes, parametrize, pinhole, put, refuses, write_image
-from splinecli.capture import find_captures, open_capture
+from splinecli.capture import CaptureOptions, find_captures, open_capture
 from splinecli.capture.light_search import NoLightsError
 from splinecli.capture.lights_in_names import lights_in_names
 from splinecli.errors import InputError
@@ -108,6 +108,13 @@ def test_other_tables_in_the_folder_above(tmp_path):
     put(tmp_path / "outside.csv", PLACES["Lights/lights.csv"])
     with pytest.raises(NoLightsError):
         open_capture(tmp_path / "owl")
+
+
+def test_a_picture_of_another_size_is_left_out_without_lights(tmp_path):
+    scenes.write_capture(tmp_path, pictures(), None)
+    write_image(tmp_path / "Thumbs.png", pictures()[0][:9, :9])
+    source = open_capture(tmp_path, CaptureOptions(needs_lights=False))
+    assert source.n_lights == len(pictures()) and "images_left_out" in codes(source)
 
 
 def test_ways_out_that_work(tmp_path):

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -346,9 +346,14 @@ def _read_lights(
     and warnings.
     """
     path = files.light_directions
-    if path is None:
-        return files, placeholders(len(files.images)), None, []
     warnings = []
+    if path is None:
+        images = _alike(files.images, _stated_size)
+        if len(images) < len(files.images):
+            others = [image for image in files.images if image not in images]
+            text = f"{short_list(others)}: left out, because most images have another size."
+            warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
+        return replace(files, images=images), placeholders(len(images)), None, warnings
     images, table, directions = _match_count(files.images, path, frame, form)
     if len(images) < len(files.images):
         others = [image.name for image in files.images if image not in images]
@@ -424,12 +429,8 @@ def _match_count(
         return images, *read_lights(path, len(images), frame, form)
     except InputError as error:
         for key in (_stated_size, lambda image: re.sub(r"\d+", "0", image.name.lower())):
-            keys = [key(image) for image in images]
-            (usual, count), *others = Counter(keys).most_common(2)
-            alike = tuple(
-                image for image, of_image in zip(images, keys, strict=True) if of_image == usual
-            )
-            if others and others[0][1] < count:
+            alike = _alike(images, key)
+            if len(alike) < len(images):
                 with suppress(InputError):
                     return alike, *read_lights(path, len(alike), frame, form)
         if not isinstance(error, WrongCountError):
@@ -443,6 +444,15 @@ def _match_count(
                 " --lights-in-channels"
             )
         raise error.with_hint(hint) from None
+
+
+def _alike(images: tuple[Path, ...], key: Callable[[Path], object]) -> tuple[Path, ...]:
+    """Return the images with the most frequent key, or all if two keys are equally frequent."""
+    keys = [key(image) for image in images]
+    (usual, count), *others = Counter(keys).most_common(2)
+    if others and others[0][1] == count:
+        return images
+    return tuple(image for image, own in zip(images, keys, strict=True) if own == usual)
 
 
 def _is_colour(images: Sequence[Path]) -> bool:
