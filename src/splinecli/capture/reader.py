@@ -350,8 +350,8 @@ def _read_lights(
     if path is None:
         images = _alike(files.images, _stated_size)
         if len(images) < len(files.images):
-            others = [image for image in files.images if image not in images]
-            text = f"{short_list(others)}: left out, because most images have another size."
+            odd = [image for image in files.images if image not in images]
+            text = f"{short_list(odd)}: left out, because most images have another size."
             warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
         return replace(files, images=images), placeholders(len(images)), None, warnings
     images, table, directions = _match_count(files.images, path, frame, form)
