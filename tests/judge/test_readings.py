@@ -100,6 +100,16 @@ def test_encoded_values(shape, lights, known):
         assert warning.error_deg == approx(error_of(encode(linear), directions, shape), rel=0.35)
 
 
+@parametrize("exponent", [1.0, 1.25])
+def test_a_weak_curve_is_not_decided(exponent):
+    directions = LIGHTS["two rings"]
+    observed = values("ball", directions) ** (1 / exponent)
+    warnings = warnings_of(as_capture(observed, directions, surface("ball")[1]))
+    undecided = [each for each in warnings if each.code == "reading_undecided"]
+    assert ["a transfer curve (" in each.text for each in undecided] == [True] * (exponent > 1)
+    assert all(1 <= each.error_deg < error_of(observed, directions, "ball") for each in undecided)
+
+
 @parametrize("lights", LIGHTS)
 def test_a_flat_object_is_not_accused_of_another_fault(lights):
     """Its pixels repeat each other, so that its images hardly determine how to read them."""

@@ -14,7 +14,7 @@ from splinecli.capture.source import Source
 from splinecli.errors import InputError
 from splinecli.images.lamps import estimate_light_intensities
 from splinecli.judge.evidence import Evidence
-from splinecli.judge.explanations import CLEAR, LIKELY, SRGB_EXPONENT, Doubt, Explanation, Kind
+from splinecli.judge.explanations import CLEAR, LIKELY, SRGB_EXPONENT, Doubt, Explanation
 from splinecli.judge.judge_net import TILTED, TRANSLUCENT
 from splinecli.judge.light_check import WRITES_MENDED, LightCheck, light_warnings
 from splinecli.judge.odd_images import check_ground_truth
@@ -36,6 +36,9 @@ LEAST_EXPECTED = 0.1  # smallest expected share of normals within 5 degrees with
 # with wrong or moved ones, no reading reduces the residual as much.
 DECISIVE = 0.35
 _MOST_NAMED = 4  # shifted images in a sentence
+# Of readings that are named although none is probable: the least probability, and the least change
+# of the normals to be expected, chosen on rendered captures (benchmarks/judgement.py).
+_NAMED_SHARE, _UNDECIDED_DEG = 0.03, 2.0
 _TRANSLUCENT_DEG = 8.0  # the usual median error of normals of translucent objects
 
 
@@ -340,7 +343,9 @@ def _words(seen: Evidence, doubt: Doubt) -> tuple[WarningKind, str, str] | None:
     return codes.UNEQUAL_INTENSITIES, cause, advice
 
 
-_CAUSES: dict[Kind, str] = {
+_CAUSES = {
+    TRANSLUCENT: "a translucent material",
+    TILTED: "lights tilted together",
     "curve": "a transfer curve (--transfer)",
     "near": "near lamps (--light-distance)",
     "offset": "ambient light (--ambient)",
@@ -371,6 +376,37 @@ def _of_given_intensities(given: Float64Array, reading: Explanation, left: str) 
         " equal."
     )
     return cause, advice
+
+
+def undecided_readings(seen: Evidence) -> list[CaptureWarning]:
+    """Warn about other readings, none of which is probable enough to be named as a fault, but which
+    together would change the normals.
+    """
+    errors_deg: dict[str, float] = {}
+    if seen.shares.get(TRANSLUCENT, 0.0) < LIKELY:  # otherwise it is named
+        errors_deg[TRANSLUCENT] = _TRANSLUCENT_DEG
+    if seen.tilt is not None and not seen.has_positions:
+        lights = seen.directions @ seen.tilt.matrix.T
+        errors_deg[TILTED] = median_turn_deg(seen.observations, seen.directions, lights)
+    shares = {kind: share for kind, share in seen.shares.items() if share > _NAMED_SHARE}
+    for kind in seen.open_kinds & shares.keys():
+        reading = seen.explanations.readings[kind]
+        errors_deg[kind] = seen.explanations.error_deg(reading, seen.estimated)
+    shares = {kind: shares[kind] for kind in errors_deg.keys() & shares.keys()}
+    error_deg = sum(share * errors_deg[kind] for kind, share in shares.items())
+    if error_deg < _UNDECIDED_DEG:
+        return []
+    likeliest = sorted(shares, key=lambda kind: -shares[kind])[:3]
+    named = " or ".join(
+        f"{_CAUSES[kind].split(' (')[0]} ({100 * shares[kind]:.0f} %)" for kind in likeliest
+    )
+    most_deg = max(errors_deg[kind] for kind in likeliest)
+    text = (
+        f"The images may also be explained by {named}, which would rotate the normals by up to"
+        f" {most_deg:.0f} degrees. The images do not decide this, so the confidence is lowered."
+    )
+    # Half of it makes the expected shares of right normals agree with the true ones.
+    return [CaptureWarning(codes.UNDECIDED, text, error_deg / 2)]
 
 
 def few_lights(seen: Evidence) -> list[Finding]:
@@ -494,6 +530,8 @@ def check_capture(source: Source, capture: Capture, *, strict: bool = False) -> 
                 remedy = _remedy(given, seen, (*remedy.faults, finding))
             doubted = finding.warning.kind in DOUBTED and not finding.harmless
             relies &= finding.after is not None or not doubted
+    if relies and not any(warning.is_error for warning in warnings):
+        warnings += undecided_readings(seen)
     if light_check is None and not seen.found:
         light_check = seen.light_check
     mended = _remedy(given, seen, ()).lights

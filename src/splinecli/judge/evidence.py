@@ -179,18 +179,23 @@ class Evidence:
         return dict(zip(CLASSES, judge_net().probabilities(features).tolist(), strict=True))
 
     @cached_property
-    def doubt(self) -> Doubt | None:
-        """The other reading that is most probably right, and its probability; None if the given
-        reading is more probable, or the readings cannot be compared.
-        """
-        shares, readings = self.shares, self.explanations.readings
-        kinds = set(readings) - self.accepted
+    def open_kinds(self) -> set[Kind]:
+        """The kinds of readings that may be right instead of the given reading."""
+        kinds = set(self.explanations.readings) - self.accepted
         if not self.linear:
             kinds -= {"curve"}
         if self.has_positions:  # distant lights in spite of them explain what else is found
             kinds = kinds - {"near"} if self.lamps is not None else set()
         if self.estimated is not None:  # they are divided out
             kinds -= {"intensities"}
+        return kinds
+
+    @cached_property
+    def doubt(self) -> Doubt | None:
+        """The other reading that is most probably right, and its probability; None if the given
+        reading is more probable, or the readings cannot be compared.
+        """
+        shares, kinds = self.shares, self.open_kinds
         if not kinds:
             return None
         best, *others = sorted(kinds, key=lambda kind: -shares[kind])
@@ -199,7 +204,7 @@ class Evidence:
         total = float(sum(shares[kind] for kind in kinds))
         # Explanations that are this likely, compared with the likeliest one, are named beside it.
         likely = tuple(kind for kind in others if shares[kind] > 0.3 * shares[best])
-        return Doubt(readings[best], total, likely)
+        return Doubt(self.explanations.readings[best], total, likely)
 
     @cached_property
     def tilt(self) -> Tilt | None:

@@ -39,6 +39,7 @@ _RIM_WEIGHT, _TOLD_APART, _ROTATED = 1.0, 0.5, 4.0
 # Lights of metals, of which three images leave more, are only doubted. Others that are corrected
 # leave at most the second share of the residual of random orders.
 _METALLIC, _FITS_WELL, _CLEARLY_BETTER = 0.25, 0.25, 2.0
+_RING_DEG = 4.0  # spread of elevations below which lights form a single ring
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,7 @@ class LightCheck:
     residual: float = 0.0  # what three images leave of all others, as a share of the brightness
     # an image that contradicts the others, without which all this was found
     odd_image: OddImage | None = None
+    in_ring: bool = False  # whether all lights have the same elevation
 
     @property
     def given(self) -> Candidate:
@@ -99,6 +101,8 @@ class LightCheck:
                 f"their order (fewer than {FEWEST_TO_ORDER} lights, too few lit pixels, or a flat"
                 " object)"
             )
+        if self.in_ring:
+            missing.append("their elevation (as all have the same, a wrong one fits as well)")
         if self.order == UNKNOWN_ORDER or self.best is not None:
             return missing
         if not np.isfinite(self.given.curl):
@@ -242,6 +246,7 @@ def _check_frame_and_order(
         error_deg=turn_deg,
         shadows_tell=shadows_tell,
         residual=residual,
+        in_ring=bool(np.ptp(np.arcsin(lights[:, 2].clip(-1, 1))) < np.radians(_RING_DEG)),
         lacks_shadows=lacks_shadows and not (order or best or check.outline_tells),
     )
 

@@ -44,6 +44,7 @@ from splinecli.records.capture_warnings import (
     LIGHTS_UNCERTAIN,
     NOT_DISTILLED,
     ROUGH_LIGHTS,
+    UNDECIDED,
     UNTRAINED_LIGHTS,
     CaptureWarning,
     lights_mended,
@@ -88,6 +89,7 @@ _SHEET_CAPTION = (
     "The images as they are used, each with its light; the rim of the disc is at 90° from the"
     " camera axis"
 )
+_LOWERING = (LIGHTS_UNCERTAIN, UNDECIDED)  # notes that explain a low confidence
 _LIGHTS_CAPTION = (
     "The lights that were found, around the camera axis; circles have the radius of their expected"
     " errors"
@@ -228,9 +230,7 @@ def estimate_capture(
         for text in estimator.warn_of_lights(capture.n_lights)
     ]
     # Other warnings about errors already explain a low confidence.
-    if not any(
-        each.error_deg and (each.is_error or each.kind is LIGHTS_UNCERTAIN) for each in warnings
-    ):
+    if not any(each.error_deg and (each.is_error or each.kind in _LOWERING) for each in warnings):
         warnings += check_confidence(estimate.expected_under_5)
     refuse_if_strict(warnings, capture.name, strict=strict, mended=mended)
     estimate = replace(estimate, capture=replace(estimate.capture, warnings=tuple(warnings)))

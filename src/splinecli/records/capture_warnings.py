@@ -246,8 +246,8 @@ LIGHTS_NEAR_AXIS = WarningKind(
 )
 LIGHTS_UNCHECKED = WarningKind(
     "lights_unchecked",
-    "Shadows that the lights should cast are missing; with `--strict`, also if the order or the"
-    " frame of the lights [cannot be checked](input-checks.md#wrong-light-directions)",
+    "Shadows that the lights should cast are missing; with `--strict`, also if the order, the"
+    " frame or the elevation of the lights [cannot be checked](input-checks.md#wrong-light-directions)",
     "Compare bumps and hollows with the object",
 )
 LIGHTS_TILTED = fault(
@@ -344,6 +344,12 @@ SOFT_IMAGES = fault(
     "soft_images",
     "The outline and all shadows are [blurred](image-preparation.md#lens-blur) by 2 pixels or more",
     "Photograph the object again, in focus",
+)
+UNDECIDED = WarningKind(
+    "reading_undecided",
+    "Other explanations, such as near lamps, [remain possible](input-checks.md), so the confidence"
+    " is lowered",
+    "Check how the capture was made; more lights, well spread, decide more",
 )
 UNEQUAL_INTENSITIES = fault(
     "unequal_intensities",
