@@ -127,7 +127,7 @@ def test_warnings(capture_folder, write_image):
     for number in range(8, 12):
         write_image(f"vase/img{number}.png", pixels)
     assert texts(read_capture(capture_folder).warnings) == (
-        "5.0 % of the observations are saturated; a shorter exposure gives better normals.",
+        "5.0 % of the observations are saturated. A shorter exposure gives better normals.",
         "The images have 8 bits, which costs less than 0.5 degrees.",
     )
     for n_black, share in ((1, None), (2, "2.0"), (100, "100.0")):

@@ -29,7 +29,7 @@ def write_lights(folder, change):
 
 def test_a_flipped_axis_is_mended_unless_a_frame_is_given(run, medallion):
     write_lights(medallion, lambda lights: lights * (1, -1, 1))
-    why = "with y negated (curl 0.03 against 0.52, outline +1.00 against -0.00). "
+    why = "with y negated (curl 0.03 instead of 0.52, outline +1.00 instead of -0.00). "
     found = {}
     for options, says in (
         ("", f"{why}They were corrected; --light-frame x-right,y-up keeps"),
@@ -44,7 +44,7 @@ def test_a_flipped_axis_is_mended_unless_a_frame_is_given(run, medallion):
     assert mended[1:] == (["light_frame"], ["lights_mended"])
     assert kept[1:] == ([], ["light_frame"])
     assert given[1:] == ([], [])
-    says = "Leave --strict out to go on with this corrected."
+    says = "Leave --strict out to continue with this corrected."
     run(f"infer {medallion} --method ls --strict --overwrite", input_error=says)
 
 
@@ -62,7 +62,7 @@ def test_strict_writes_nothing_and_ends_with_3(run, medallion):
         f"infer {medallion} --method ls --strict",
         input_error=(
             "much better if image 1 belongs to light 2, image 2 to the next, and so on",
-            "Leave --strict out to go on with this corrected.",
+            "Leave --strict out to continue with this corrected.",
         ),
         out="",
     )
@@ -164,8 +164,8 @@ def test_angles_from_the_camera_axis_are_told_by_the_images(run, medallion):
     result = run(
         f"info {medallion} --light-format azel --strict --json",
         input_error=(
-            "much better if their elevations count from the camera axis (misfit",
-            "Replace each elevation by 90 degrees minus it.",
+            "much better if their elevations are measured from the camera axis (misfit",
+            "Replace each elevation with 90 degrees minus its value.",
         ),
     )
     assert result.json["warning_codes"] == ["light_frame"]

@@ -1,3 +1,1 @@
-"""Find faults of a capture by comparing its images, lights and ground truth. Nothing here changes
-data.
-"""
+"""Find faults in a capture by comparing its images, lights and ground truth. Nothing is changed."""

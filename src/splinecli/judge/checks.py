@@ -1,6 +1,4 @@
-"""The checks of a capture's lights and images against each other, which `infer` and `info` make, in
-their order.
-"""
+"""Check that the lights and images of a capture are consistent, as `infer` and `info` do."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -28,12 +26,12 @@ from splinecli.records.capture_warnings import CaptureWarning, WarningKind
 
 ALIGN_ADVICE = "Add --align, or photograph from a tripod."
 TILT_ADVICE = (
-    "They may have been measured in another frame than the camera's, such as the table's. Tilt them"
+    "They may have been measured in a frame other than the camera's, such as the table's. Tilt them"
     " back"
 )
 LEAST_EXPECTED = 0.1  # smallest expected share of normals within 5 degrees without a warning
-# Largest ratio of residuals at which another reading shows that lights and images belong together:
-# with wrong or moved ones, no reading reduces the residual as much.
+# If another reading reduces the residual to at most this share, lights and images belong together,
+# because no reading reduces it as much with wrong lights or moved images.
 DECISIVE = 0.35
 _MOST_NAMED = 4  # shifted images in a sentence
 # Of readings that are named although none is probable: the least probability, and the least change
@@ -46,13 +44,13 @@ class Finding(NamedTuple):
     """A fault that a check found."""
 
     warning: CaptureWarning
-    # the evidence once the fault is mended, which the next checks use; None if nothing mends it
+    # the evidence with the fault corrected, for the next checks; None if it cannot be corrected
     after: Evidence | None = None
-    # whether the fault is so clear that it is mended without being asked
+    # whether the fault is clear enough to be corrected by default
     clear: bool = False
-    # whether the checks that follow do not depend on it although it is not mended
+    # whether the next checks remain reliable if the fault is not corrected
     harmless: bool = False
-    cause: str = ""  # a sentence that says why, for a fault that can be mended
+    cause: str = ""  # a sentence, for a fault that can be corrected
 
 
 def shifted_images(seen: Evidence) -> Iterator[Finding]:
@@ -74,8 +72,8 @@ def shifted_images(seen: Evidence) -> Iterator[Finding]:
 
 
 def _explains_more(after: Evidence, before: Evidence) -> bool:
-    """Return whether three images explain the others better after images were moved back, and the
-    normals have no more curl.
+    """Return whether three images explain the others better once images are moved back, and the
+    normals have no more curl than before.
     """
     if after.factors is None or before.factors is None or not (after.tilt and before.tilt):
         return False
@@ -84,9 +82,9 @@ def _explains_more(after: Evidence, before: Evidence) -> bool:
 
 
 def other_scale(seen: Evidence) -> Iterator[Finding]:
-    """Warn about an image whose values have fewer bits than those of the others."""
+    """Warn about an image whose bit depth seems to differ from the others."""
     values, lights = np.asarray(seen.observations, np.float64), seen.directions
-    # one image may be much brighter
+    # one image may be much brighter than the others
     values = values / np.maximum(np.median(values, axis=1, keepdims=True), 1e-12)
     predicted = fit_robustly(values, np.ones_like(values), lights, 6)[0] @ lights.T
     lit = predicted > 0.3  # of a pixel's median
@@ -100,8 +98,8 @@ def other_scale(seen: Evidence) -> Iterator[Finding]:
         if alike.mean() < 0.6:
             continue
         stops = abs(np.log2(max(factor, 1e-6)))
-        # The bits that cameras of 12, 10 and 8 bits leave unused in 16-bit files, and by how many
-        # bits the brightness of an image may differ from them.
+        # Cameras with 12, 10 and 8 bits leave 4, 6 and 8 bits of 16-bit files unused. The
+        # brightness of an image may deviate from this by 0.2 bits.
         bits = min((4, 6, 8), key=lambda bits: abs(bits - stops))
         if abs(bits - stops) > 0.2:
             continue
@@ -120,11 +118,12 @@ def other_scale(seen: Evidence) -> Iterator[Finding]:
 
 
 def odd_image(seen: Evidence) -> Iterator[Finding]:
-    """Warn about an image that contradicts the others, and is not only shifted."""
+    """Warn about an image that contradicts the others for a reason other than a shift."""
     for name, largest in zip(seen.names, seen.sample.observations.max(axis=0), strict=True):
         if largest <= 0:
             text = (
-                f"{name} is black: its lamp probably failed. Photograph it again, or leave it out."
+                f"{name} is black, probably because its lamp failed. Photograph it again, or leave"
+                " it out."
             )
             place = seen.names.index(name)
             error_deg = _turn_by_deg(seen, [place])
@@ -153,8 +152,8 @@ def odd_image(seen: Evidence) -> Iterator[Finding]:
 
 
 def _turn_by_deg(seen: Evidence, places: list[int]) -> float | None:
-    """Return the angles in degrees by which images change the normals found from the others; None
-    with too few others.
+    """Return the median angle in degrees by which images change the normals estimated from the
+    others; None if fewer than three others are left.
     """
     others = [place for place in range(len(seen.names)) if place not in places]
     if len(others) < 3:
@@ -169,7 +168,7 @@ def missing_mask(seen: Evidence) -> Iterator[Finding]:
             f"{100 * seen.background:.0f} % of the pixels are nearly black. If they are"
             " background, their normals"
         )
-        text += " are meaningless: add --auto-mask, or give a mask."
+        text += " are meaningless, so add --auto-mask or pass a mask."
         yield Finding(CaptureWarning(codes.NO_MASK, text))
 
 
@@ -178,10 +177,9 @@ def crowded_lights(seen: Evidence) -> Iterator[Finding]:
     if spread < 0.1:  # see light_spread; such lights determine the normals poorly
         where = "in a narrow cone" if in_cone else "nearly in one plane with the object"
         text = (
-            f"All lights are {where}, which amplifies noise and errors of their directions by a"
-            " factor of about"
+            f"All lights are {where}, which amplifies noise and errors in the light directions by a"
+            f" factor of about {1 / max(spread, 1e-3):.0f}. Add lights from other sides."
         )
-        text += f" {1 / max(spread, 1e-3):.0f} in the normals. Add lights from other sides."
         yield Finding(CaptureWarning(codes.LIGHTS_ILL_CONDITIONED, text))
 
 
@@ -196,7 +194,7 @@ def same_images(seen: Evidence) -> Iterator[Finding]:
         others = len(pairs) - 1
         more = f" (and {others} more pair{'s' if others > 1 else ''})" if others else ""
         text = f"{first} and {second} are the same image{more}{differ}."
-        text += " Remove one, or replace it by its own photograph."
+        text += " Remove one, or replace it with the right photograph."
         # Either image of a pair may be the wrong one.
         wrong = [sorted({pair[which] for pair in pairs}) for which in (0, 1)] if differ else []
         errors_deg = [
@@ -206,7 +204,7 @@ def same_images(seen: Evidence) -> Iterator[Finding]:
 
 
 def wrong_lights(seen: Evidence) -> Iterator[Finding]:
-    """Warn about lights in another frame or order."""
+    """Warn about lights in a wrong frame or order."""
     check = seen.light_check
     mended = None if check.mended is None else seen.under_lights(check.mended)
     for warning, cause in light_warnings(check, seen.origin, seen.frame, seen.strict):
@@ -216,7 +214,7 @@ def wrong_lights(seen: Evidence) -> Iterator[Finding]:
 
 
 def tilted_lights(seen: Evidence) -> Iterator[Finding]:
-    """Warn about lights that are all tilted together."""
+    """Warn about a common tilt of all lights."""
     tilt, probability = seen.tilt, seen.shares.get(TILTED, 0.0)
     if seen.has_positions or tilt is None or probability < LIKELY:
         return
@@ -229,25 +227,26 @@ def tilted_lights(seen: Evidence) -> Iterator[Finding]:
 
 
 def strange_material(seen: Evidence) -> Iterator[Finding]:
-    """Warn about a material that no method knows."""
+    """Warn about a translucent material, which no method models."""
     if seen.shares.get(TRANSLUCENT, 0.0) < LIKELY:
         return
     text = (
-        "The object looks translucent, like wax, marble or skin: light that enters it softens the"
-        " shading, which flattens the normals by several degrees with every method."
+        "The object looks translucent, like wax, marble or skin. Light that enters such a material"
+        " softens the shading, so every method flattens the normals by several degrees."
     )
     yield Finding(CaptureWarning(codes.UNKNOWN_MATERIAL, text, _TRANSLUCENT_DEG))
 
 
 def rough_lights(seen: Evidence) -> Iterator[Finding]:
-    """Suggest refining the lights if this makes them fit much better."""
+    """Suggest refining the lights if they then fit much better."""
     if (
         seen.has_positions
         or (refined := would_refine(seen.observations, seen.factors, seen.directions)) is None
     ):
         return
     after = seen.under_lights(refined.directions).tilt
-    # The residual of gloss and fabric falls as well, but the normals then fit a surface worse.
+    # On gloss and fabric, refining also reduces the residual, but the normals then fit a surface
+    # worse.
     if seen.tilt is not None and after is not None and after.curl > 0.98 * seen.tilt.curl:
         return
     moved_deg = angle_between_deg(refined.directions, seen.directions)
@@ -260,8 +259,8 @@ def rough_lights(seen: Evidence) -> Iterator[Finding]:
 
 
 def decisive_readings(seen: Evidence) -> Iterator[Finding]:
-    """Warn about images that other readings explain so much better that lights and images must
-    match.
+    """Warn about other readings that fit so much better that lights and images must belong
+    together.
     """
     return other_readings(seen, DECISIVE, CLEAR)
 
@@ -269,10 +268,10 @@ def decisive_readings(seen: Evidence) -> Iterator[Finding]:
 def other_readings(
     seen: Evidence, largest_ratio: float = 1.0, least: float = LIKELY
 ) -> Iterator[Finding]:
-    """Warn about images that fit much better if they are read in another way; see explanations.py.
+    """Warn about other ways to read the images that fit much better; see explanations.py.
 
-    Each reading is accepted before the others are asked again. Readings that leave more than the
-    largest ratio of the residual, or are less probable than `least`, are not named.
+    Each reading is accepted before the others are compared again. Readings that leave more than
+    `largest_ratio` of the residual, or are less probable than `least`, are not reported.
     """
     while (doubt := seen.doubt) is not None:
         reading = doubt.reading
@@ -290,8 +289,8 @@ def other_readings(
 
 
 def _words(seen: Evidence, doubt: Doubt) -> tuple[WarningKind, str, str] | None:
-    """Return the warning of another reading: its kind, the cause, and what to do; None if `infer`
-    reads the images so anyway.
+    """Return the kind, the cause and the advice of the warning about another reading; None if
+    `infer` already reads the images that way.
     """
     reading = doubt.reading
     left = f"the residual falls to {100 * reading.ratio:.0f} %"
@@ -308,16 +307,16 @@ def _words(seen: Evidence, doubt: Doubt) -> tuple[WarningKind, str, str] | None:
             f" treated as distant: at this distance, {left}."
         )
         advice = (
-            "Measure the distance and the width of the object, or try --light-distance"
+            "Measure the distance of the lamps and the width of the object, or try --light-distance"
             f" {reading.amount:.1f} --object-width 1."
         )
         return codes.NEAR_LIGHTS_SUSPECTED, cause, advice
     if reading.kind == "offset":
         cause = (
-            "All images look as if they contained ambient light, or a black level that was not"
-            f" subtracted: {100 * reading.amount:.0f} % of the light of a lamp. Without it, {left}."
+            "All images seem to contain ambient light, or a black level that was not subtracted, of"
+            f" about {100 * reading.amount:.0f} % of a lamp's light: without it, {left}."
         )
-        advice = "Photograph the object with all lamps off and give this image with --ambient."
+        advice = "Photograph the object with all lamps off, and pass this image with --ambient."
         return codes.CONSTANT_LIGHT, cause, advice
     if reading.kind == "elevation":
         how = "low" if reading.amount > 1 else "high"
@@ -334,11 +333,11 @@ def _words(seen: Evidence, doubt: Doubt) -> tuple[WarningKind, str, str] | None:
     if seen.intensities is not None:
         return codes.UNEQUAL_INTENSITIES, *_of_given_intensities(seen.intensities, reading, left)
     if estimate_light_intensities(observations, None, seen.directions) is not None:
-        return None  # `infer` estimates them, and reports it
-    cause = f"The lights seem to differ in intensity: with other intensities, {left}."
+        return None  # `infer` estimates them and says so
+    cause = f"The lights seem to differ in intensity: with unequal intensities, {left}."
     advice = (
         "The images do not determine them, so equal ones are assumed. Measure them with calibrate"
-        " --gray-card, or give them with --intensities FILE."
+        " --gray-card, or pass them with --intensities FILE."
     )
     return codes.UNEQUAL_INTENSITIES, cause, advice
 
@@ -364,7 +363,7 @@ def _of_given_intensities(given: Float64Array, reading: Explanation, left: str) 
     }
     errors = {words: float(np.std(needed - way)) for words, way in ways.items()}
     words = min(errors, key=lambda each: errors[each])
-    # A simple reading of the file leaves at most this share of the spread.
+    # A simple reading of the file is named if it leaves less than this share of the spread.
     how = (
         f", for example {words}"
         if errors[words] < 0.4 * np.std(np.log(reading.intensities))
@@ -410,7 +409,9 @@ def undecided_readings(seen: Evidence) -> list[CaptureWarning]:
 
 
 def few_lights(seen: Evidence) -> list[Finding]:
-    """Warn about fewer lights than eight, unless they are channels: one colour image has three."""
+    """Warn about fewer than eight lights, except for lights in channels, because one colour image
+    has three.
+    """
     count = len(seen.names)
     few = count < 8 and not seen.in_channels
     text = f"There are {count} lights; use 8 or more, well spread."
@@ -418,7 +419,7 @@ def few_lights(seen: Evidence) -> list[Finding]:
 
 
 def lights_near_axis(seen: Evidence) -> list[Finding]:
-    """Warn about lights that all shine from near the camera."""
+    """Warn about lights that are all close to the camera axis."""
     if np.degrees(np.arccos(seen.directions[:, 2].clip(-1, 1))).max() >= 25:
         return []
     text = "All lights are within 25 degrees of the camera axis; lower lights give better normals."
@@ -426,12 +427,12 @@ def lights_near_axis(seen: Evidence) -> list[Finding]:
 
 
 def wrong_truth(seen: Evidence) -> Iterator[Finding]:
-    """Warn about a ground truth that does not fit."""
+    """Warn about a ground truth that does not fit the images."""
     for warning in check_ground_truth(seen.evened, seen.directions, seen.truth):
         yield Finding(warning)
 
 
-# With these faults, no check that relies on the lights is reliable, unless they are mended.
+# Unless these faults are corrected, no check that depends on the lights is reliable.
 DOUBTED = frozenset(
     {
         codes.REPEATED_IMAGES,
@@ -447,11 +448,10 @@ class Check:
     """A row of CHECKS."""
 
     find: Callable[[Evidence], Iterable[Finding]]
-    needs_lights: bool = True  # whether it is skipped if the lights are not to be relied on
+    needs_lights: bool = True  # whether it is skipped if the lights are unreliable
 
 
-# The checks of a capture's lights and images, in their order. Each uses the evidence in which the
-# faults before it are mended.
+# The checks, in order. Each uses the evidence in which the faults found so far are corrected.
 CHECKS = [
     Check(same_images, needs_lights=False),
     Check(missing_mask, needs_lights=False),
@@ -473,30 +473,31 @@ CHECKS = [
 
 @dataclass(frozen=True, eq=False)
 class Remedy:
-    """How a capture is read once its clear faults are corrected."""
+    """The changes that correct the clear faults of a capture."""
 
     faults: tuple[Finding, ...]
-    lights: Float64Array | None = None  # (F, 3); None as given
+    lights: Float64Array | None = None  # (F, 3); None to keep the given ones
     light_error_deg: float | None = None  # of lights that were estimated from the images
-    curve: float | None = None  # the exponent of the transfer curve; None as given
-    align: bool = False  # whether images are aligned
+    curve: float | None = None  # exponent of the transfer curve; None to keep the given one
+    align: bool = False  # whether the images are aligned
 
 
 class Judgement(NamedTuple):
-    """What the checks found."""
+    """The result of the checks."""
 
     warnings: tuple[CaptureWarning, ...]
     light_check: LightCheck | None  # None if the lights were estimated from the images
-    # (F, 3), the lights after all faults that were found are mended; None as given, or if an image
-    # was left out
+    # (F, 3), the lights with all faults corrected; None if none of them changes, or an image was
+    # left out
     mended_lights: Float64Array | None = None
-    remedy: Remedy | None = None  # of the clear faults, None if there are none
+    remedy: Remedy | None = None  # for the clear faults; None if there are none
 
 
 def check_capture(source: Source, capture: Capture, *, strict: bool = False) -> Judgement:
-    """Check the lights and images of a capture that was prepared from this source.
+    """Return the warnings about a capture's lights and images, and the remedy for clear faults.
 
-    With `strict`, properties that the images leave undetermined are warnings, too.
+    The capture must have been prepared from this source. With `strict`, also warn of properties
+    that the images leave undetermined.
 
     Examples:
         >>> from splinecli.capture import open_capture
@@ -507,7 +508,7 @@ def check_capture(source: Source, capture: Capture, *, strict: bool = False) -> 
         ()
     """
     seen = Evidence.of(source, capture, strict=strict)
-    # without dark background
+    # leave out dark background
     (sample, background), (closeup, _) = (
         leave_out_background(seen.sample),
         leave_out_background(seen.closeup),
@@ -523,7 +524,8 @@ def check_capture(source: Source, capture: Capture, *, strict: bool = False) -> 
             light_check = seen.light_check
         for finding in check.find(seen):
             warnings.append(finding.warning)
-            # A fault that was found after one that is not clear depends on that.
+            # A fault found after an unclear one is not clear either, because it depends on that
+            # one.
             clear &= finding.clear or finding.after is None
             seen = finding.after or seen
             if clear and finding.clear and finding.after is not None:
@@ -539,7 +541,7 @@ def check_capture(source: Source, capture: Capture, *, strict: bool = False) -> 
 
 
 def _remedy(given: Evidence, seen: Evidence, faults: tuple[Finding, ...]) -> Remedy:
-    """Return how the given evidence becomes the evidence in which faults are mended."""
+    """Return the remedy that turns the given evidence into the evidence with corrected faults."""
     differ = given.indices == seen.indices and (given.directions != seen.directions).any()
     return Remedy(
         faults,
@@ -553,37 +555,37 @@ def light_spread(light_directions: Float64Array) -> tuple[float, bool]:
     """Return how well lights (F, 3) determine a normal, and whether they form a cone rather than a
     plane.
 
-    The first is their smallest singular value over sqrt(F): the error of a normal is about the
-    error of an observation over it. It is 0 for coplanar lights, 0.58 for lights that are spread
-    over the whole sphere.
+    The first value is their smallest singular value over sqrt(F). The error of a normal is about
+    the error of an observation divided by this value, which is 0 for coplanar lights and 0.58 for
+    lights spread over the whole sphere.
     """
     values = np.linalg.svd(light_directions, compute_uv=False) / np.sqrt(len(light_directions))
     return float(values[-1]), bool(values[-2] < 2 * values[-1])
 
 
 def repeated_images(observations: Floats) -> list[tuple[int, int]]:
-    """Return the first image and each later one among observations (P, F) that are equal up to a
-    scale, and not uniform.
+    """Return pairs of images among observations (P, F) that are equal up to a scale. Uniform images
+    are ignored. Each later image is paired with the first one that equals it.
     """
     values = observations.astype(np.float64)
     values = values / np.maximum(np.linalg.norm(values, axis=0), 1e-300)
     varied = np.ptp(values, axis=0) > 0
-    # One minus the cosine between two images that are the same, up to rounding. Noise gives 1e-6
-    # and more.
+    # Rounding changes the cosine between two equal images by less than this, noise by 1e-6 and
+    # more.
     same = (1 - values.T @ values < 1e-12) & varied[:, None]
     pairs = zip(same.argmax(axis=0).tolist(), range(len(same)), strict=True)
     return [(first, second) for first, second in pairs if first < second and varied[second]]
 
 
 def check_confidence(expected_under_5: float | None) -> list[CaptureWarning]:
-    """Warn about a capture if the network expects hardly any normal to be right; None for a method
-    without this estimate.
+    """Warn about a capture if the network expects hardly any normal to be accurate. The share is
+    None for methods that do not predict errors.
     """
     if expected_under_5 is None or expected_under_5 >= LEAST_EXPECTED:
         return []
     text = (
         f"The network expects only {100 * expected_under_5:.0f} % of the normals to be within 5"
-        " degrees. The lights, the mask or the images are probably wrong: see"
+        " degrees. The lights, the mask or the images are probably wrong; see"
         " docs/troubleshooting.md."
     )
     return [CaptureWarning(codes.LOW_CONFIDENCE, text)]
@@ -596,12 +598,12 @@ def refuse_if_strict(
     strict: bool,
     mended: Collection[WarningKind] = (),
 ) -> None:
-    """Raise InputError for the first warning that says that an input is probably wrong, if
-    `strict`. Otherwise, faults of the kinds `mended` are corrected.
+    """If `strict`, raise InputError for the first warning that an input is probably wrong. Without
+    --strict, `infer` corrects the faults of the kinds `mended`, as the hint says.
     """
     wrong = next((warning for warning in warnings if warning.is_error), None)
     if strict and wrong is not None:
-        how = "with this corrected" if wrong.kind in mended else "nevertheless"
+        how = "with this corrected" if wrong.kind in mended else "anyway"
         raise InputError(
-            f"{name}: {wrong.text.removesuffix('.')}", hint=f"Leave --strict out to go on {how}"
+            f"{name}: {wrong.text.removesuffix('.')}", hint=f"Leave --strict out to continue {how}"
         )

@@ -1,5 +1,5 @@
-"""The evidence that all checks share: a capture's lights, from files or arguments, a sample of its
-pixels, and what is fitted to them, once.
+"""The evidence shared by all checks: a capture's lights, a sample of its pixels, and the quantities
+that are fitted to them only once.
 """
 
 from __future__ import annotations
@@ -42,45 +42,45 @@ class Evidence:
     """F images and their lights, the input of the checks.
 
     Quantities that several checks need, such as factors, the best explanation and shifts, are
-    computed once, when they are first needed.
+    computed once, on first use.
     """
 
     names: Sequence[str]
-    all_directions: Float64Array  # (N, 3), all lights of the file, in its order
+    all_directions: Float64Array  # (N, 3), all lights in the order of the file
     indices: Sequence[int]  # (F,), the lights of the images
-    sample: Sample  # not divided by estimated intensities, as the closeup
-    closeup: Sample
-    intensities_measured: bool  # whether the intensities are given
-    # (F,), the given ones, by which the observations were divided
+    sample: Sample  # not divided by estimated intensities
+    closeup: Sample  # likewise
+    intensities_measured: bool  # whether the intensities were given
+    # (F,), given intensities, by which the observations were divided
     intensities: Float64Array | None = None
-    # (F,), the estimated ones, by which the sample was not divided
+    # (F,), estimated intensities, by which the sample was not divided
     estimated: Float64Array | None = None
     eight_bit: bool = False  # whether the images have 8 bits
     # all near lamps, over the sample's grid; None if the lights are treated as distant
     lamps: NearLamps | None = None
-    has_positions: bool = False  # whether positions of lamps are known
-    # whether the lights were found from these images, so that the images cannot contradict them
+    has_positions: bool = False  # whether lamp positions are known
+    # whether the lights were estimated from these images, which therefore cannot contradict them
     found: bool = False
     origin: Path = Path("light_directions")
     frame: LightFrame = USUAL_FRAME
-    linear: bool = True  # whether the values of the images are taken as linear
-    curve: float | None = None  # the exponent with which they were decoded
+    linear: bool = True  # whether the values of the images are treated as linear
+    curve: float | None = None  # exponent with which they were decoded
     truth: Floats | None = None  # (H, W, 3), the ground truth of the whole images, or None
     strict: bool = False  # also warn of properties that the images leave undetermined
-    in_channels: bool = False  # whether each channel of a colour image has a light of its own
+    in_channels: bool = False  # whether each channel of a colour image has its own light
     copies: Sequence[tuple[int, int]] = ()  # places of images whose files are equal
-    background: float = 0.0  # the share of dark background that was left out of the sample
-    # what was found before: other readings that were accepted, places of images moved back
+    background: float = 0.0  # share of dark background that was left out of the sample
+    # from earlier checks: readings that were accepted, and places of images that were moved back
     accepted: frozenset[Kind] = frozenset()
     moved: frozenset[int] = frozenset()
 
     @classmethod
     def of(cls, source: Source, capture: Capture, *, strict: bool = False) -> Evidence:
-        """Return the evidence of a capture that was prepared from this source."""
+        """Return the evidence for a capture that was prepared from this source."""
         indices, measured = capture.light_indices, source.intensities_measured
         sample = sample_observations(capture.observations, capture.mask)
         if capture.estimated_intensities is not None:
-            # They were estimated under the lights that are in question.
+            # They were estimated under the lights that are to be checked.
             stored = sample.observations * capture.estimated_intensities
             sample = replace(sample, observations=stored)
         closeup = closeup_of(capture.mask)
@@ -147,7 +147,7 @@ class Evidence:
 
     @cached_property
     def explanations(self) -> Explanations:
-        """The sample as the files store it, to be read in other ways."""
+        """The other readings of the sample, computed from its values as stored in the files."""
         observations = (
             self.observations if self.intensities is None else self.observations * self.intensities
         )
@@ -156,7 +156,7 @@ class Evidence:
 
     @cached_property
     def coarse(self) -> Evidence:
-        """The evidence of fewer pixels, for measures that are taken after each reading."""
+        """The evidence for fewer pixels, for quantities that are computed for each reading."""
         most = min(_COARSE_PIXELS, _COARSE_VALUES // len(self.indices))
         step = int(np.ceil(np.sqrt(len(self.sample.observations) / most)))
         if step < 2:
@@ -172,7 +172,7 @@ class Evidence:
 
     @cached_property
     def shares(self) -> dict[str, float]:
-        """The probability of each class of judge_net.py; empty if the capture cannot be judged."""
+        """The probability of each class in judge_net.py; empty if the capture cannot be judged."""
         features = features_of(self)
         if features is None:
             return {}
@@ -184,16 +184,16 @@ class Evidence:
         kinds = set(self.explanations.readings) - self.accepted
         if not self.linear:
             kinds -= {"curve"}
-        if self.has_positions:  # distant lights in spite of them explain what else is found
+        if self.has_positions:  # treating them as distant explains all other findings
             kinds = kinds - {"near"} if self.lamps is not None else set()
-        if self.estimated is not None:  # they are divided out
+        if self.estimated is not None:  # and divided out
             kinds -= {"intensities"}
         return kinds
 
     @cached_property
     def doubt(self) -> Doubt | None:
-        """The other reading that is most probably right, and its probability; None if the given
-        reading is more probable, or the readings cannot be compared.
+        """The most probable other reading with its probability; None if the given reading is more
+        probable, or if the readings cannot be compared.
         """
         shares, kinds = self.shares, self.open_kinds
         if not kinds:
@@ -202,13 +202,13 @@ class Evidence:
         if shares[best] < max(shares[RIGHT], shares[TRANSLUCENT]):
             return None
         total = float(sum(shares[kind] for kind in kinds))
-        # Explanations that are this likely, compared with the likeliest one, are named beside it.
+        # Explanations that are at least this likely, relative to the likeliest one, are also named.
         likely = tuple(kind for kind in others if shares[kind] > 0.3 * shares[best])
         return Doubt(self.explanations.readings[best], total, likely)
 
     @cached_property
     def tilt(self) -> Tilt | None:
-        """The tilt of the lights that the curl of the normals shows."""
+        """The common tilt of the lights, estimated from the curl of the normals."""
         return find_tilt(self.coarse.normals, self.coarse.sample.mask)
 
     @cached_property
@@ -230,7 +230,7 @@ class Evidence:
 
     @cached_property
     def shifts(self) -> list[ImageShift]:
-        """The images that are shifted against the others."""
+        """The images that are shifted relative to the others."""
         found = find_shifts(self.closeup) or (
             find_shifts(self.sample) if self.sample.step > 1 else []
         )
@@ -244,7 +244,7 @@ class Evidence:
             for place, (right, down) in of_shading.items()
         }
         together = [shifts[place] for place in sorted(shifts)]
-        # The check of moved images is needed anyway, the check as given seldom.
+        # The light check of the moved images is needed anyway, the check of the given ones rarely.
         if (
             not of_shading
             or self.moved_back(together).light_check.order is None
@@ -255,8 +255,8 @@ class Evidence:
 
     @cached_property
     def shift_error_deg(self) -> float | None:
-        """The median angle by which shifted images change the normals; None if too few pixels are
-        left.
+        """The median angle in degrees by which shifted images change the normals; None if the
+        lights were estimated or no pixels are left.
         """
         if self.found:
             return None
@@ -278,8 +278,8 @@ class Evidence:
         return {}
 
     def moved_back(self, shifts: Sequence[ImageShift]) -> Evidence:
-        """Return the evidence after these images are moved back, of the pixels that all of them
-        show.
+        """Return the evidence with these images moved back, for the pixels that are visible in all
+        of them.
         """
         key = tuple(shifts)
         if key not in self._moved:
@@ -311,13 +311,13 @@ class Evidence:
         )
 
     def under_lights(self, directions: Float64Array) -> Evidence:
-        """Return the evidence with other lights (F, 3) of the images."""
+        """Return the evidence with other light directions (F, 3)."""
         every = self.all_directions.copy()
         every[list(self.indices)] = directions
         return replace(self, all_directions=every)
 
     def scaled(self, factors: Float64Array) -> Evidence:
-        """Return the evidence after the images are multiplied by factors (F,)."""
+        """Return the evidence with the images multiplied by factors (F,)."""
         sample, closeup = (
             replace(each, observations=each.observations * factors)
             for each in (self.sample, self.closeup)
@@ -325,7 +325,7 @@ class Evidence:
         return replace(self, sample=sample, closeup=closeup)
 
     def read_as(self, reading: Explanation) -> Evidence:
-        """Return the evidence if the images, or their lights, are read in another way."""
+        """Return the evidence with the images or their lights read in another way."""
         accepted = self.accepted | {reading.kind}
         if reading.kind == "elevation":
             lights = unit(self.directions * (1, 1, reading.amount))
@@ -366,8 +366,8 @@ class Evidence:
 
 
 def gray_intensities(intensities: Floats) -> Float64Array:
-    """Return intensities (F,), mean 1, of light whose colours (F, 3) or gray values (F,) are
-    divided out.
+    """Return the intensities (F,), with mean 1, of lights whose colours (F, 3) or gray values (F,)
+    are divided out.
     """
     values = np.asarray(intensities, np.float64)
     if values.ndim == 2:

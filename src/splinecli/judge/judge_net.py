@@ -1,9 +1,9 @@
-"""How likely each other reading of the images is right: a small network that compares all of them.
+"""Estimate the probability of each other reading of the images with a small network.
 
-Its features are the residuals under the readings (explanations.py), and independent evidence: how
-well three images explain all (the factors of light_fit.py, which do not depend on the lights), how
-well the lights fit these, and the curl of the normals, each before and after the reading. It was
-trained on rendered captures of all classes of materials, right ones and faulty ones
+Its features are the residuals under all readings (explanations.py) and independent evidence, each
+before and after the reading: how well three images explain all others (the factors of light_fit.py,
+which do not depend on the lights), how well the lights fit these factors, and the curl of the
+normals. It was trained on rendered captures of all material classes, with and without faults
 (benchmarks/train_judge_net.py).
 """
 
@@ -30,7 +30,7 @@ _LEAST = 3e-3  # added to residuals before a logarithm is taken
 
 
 class Judged(Protocol):
-    """What the features are taken from; see Evidence."""
+    """The evidence from which the features are computed; see Evidence."""
 
     @property
     def directions(self) -> Float64Array: ...
@@ -68,7 +68,7 @@ class JudgeNet(NamedTuple):
 
     def probabilities(self, features: Float64Array) -> Float64Array:
         """Return the probabilities (..., C) of CLASSES from features (..., D)."""
-        # Beyond the features of training captures, the network is held constant.
+        # The output is held constant beyond the range of the features in training.
         scaled = ((features - self.mean) / self.deviation).clip(-3, 3)
         hidden = np.tanh(np.einsum("...d,mdh->...mh", scaled, self.hidden) + self.hidden_bias)
         logits = np.einsum("...mh,mhc->...mc", hidden, self.output) + self.output_bias
@@ -88,9 +88,9 @@ def judge_net() -> JudgeNet:
 
 
 def features_of(seen: Judged) -> Float64Array | None:
-    """Return the features (D,) of the evidence, None if it has no readings.
+    """Return the features (D,) of the evidence; None if it has no readings.
 
-    Features of a reading that the lights do not determine are 0.
+    The features of a reading that the lights do not determine are 0.
     """
     readings = seen.explanations.readings
     if not readings:
@@ -120,12 +120,12 @@ def features_of(seen: Judged) -> Float64Array | None:
             float(np.std(np.log(reading.intensities))),
             *(np.log(after + _LEAST) - np.log(before + _LEAST)),
         ]
-    # A plane has no curl, whose logarithm is infinite.
+    # The curl of a plane is 0, and its logarithm infinite.
     return np.asarray(np.nan_to_num(np.array(found)).clip(-_LARGEST, _LARGEST), np.float64)
 
 
 def _of_tilt(seen: Judged) -> list[float]:
-    """Return the evidence of curl and outline about a common tilt of the lights."""
+    """Return the features of a common tilt of the lights, from the curl and the outline."""
     tilt, lights = seen.tilt, seen.directions
     found = [0.0] * 4
     if tilt is not None:
@@ -157,8 +157,8 @@ def _amount(reading: Explanation) -> float:
 
 
 def _measures(seen: Judged) -> Float64Array:
-    """Return what three images leave unexplained, how far the lights are from them with intensities
-    as known and with free ones, and the curl of the normals; NaN is unknown.
+    """Return the residual of explaining all images by three, the misfits of the lights with known
+    and with free intensities, and the curl of the normals; NaN if unknown.
     """
     curl = curl_of(seen.normals, seen.evened.mask)
     factors, lights = seen.factors, seen.directions[None]

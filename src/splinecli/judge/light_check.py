@@ -1,9 +1,8 @@
-"""Detect light directions in a wrong frame or order, from the images and the normals that they
-give.
+"""Detect light directions in a wrong frame or order from the images and the normals.
 
-The thresholds were chosen on captures of splinecli's own renderer (MERL's measured materials,
-CyclesPS's classes of materials, 6 to 48 lights, with and without errors of their directions);
-docs/measurements.md has the figures.
+The thresholds were chosen on captures rendered by splinecli (MERL's measured materials, CyclesPS's
+material classes, 6 to 48 lights, with and without errors in their directions); see
+docs/measurements.md for the figures.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -30,14 +29,15 @@ from splinecli.maths import Bools, Float64Array, Floats, Integers
 from splinecli.records import capture_warnings as codes
 from splinecli.records.capture_warnings import CaptureWarning, WarningKind
 
-# The advantage of a frame: the weight of a difference of rims, the smallest difference that
-# distinguishes two frames, and the advantage that any rotation needs, because its angle is fitted.
-# From 1 on, a frame is better.
+# The advantage of a frame, which is better from 1 on: the weight of a difference of rims, the
+# smallest difference that distinguishes two frames, and the least advantage of a rotation, which is
+# higher because its angle is fitted.
 _RIM_WEIGHT, _TOLD_APART, _ROTATED = 1.0, 0.5, 4.0
 
 
-# Lights of metals, of which three images leave more, are only doubted. Others that are corrected
-# leave at most the second share of the residual of random orders.
+# If explaining all images by three leaves more than the first residual, as for metals, the lights
+# are reported but not corrected. Corrected orders leave at most the second share of the residual of
+# random orders, and corrected frames have at least the third advantage.
 _METALLIC, _FITS_WELL, _CLEARLY_BETTER = 0.25, 0.25, 2.0
 _RING_DEG = 4.0  # spread of elevations below which lights form a single ring
 
@@ -47,44 +47,43 @@ class Candidate:
     """One reading of the light file."""
 
     name: str  # in words, such as "y negated"
-    # its frame, relative to the given one. None for an order that no frame is equivalent to
+    # its frame relative to the given one; None for an order that is not equivalent to a frame
     frame: LightFrame | None
-    # (3, 3) M, where lights @ M' are the lights in this reading
+    # (3, 3) M, where lights @ M.T are the lights in this reading
     matrix: Float64Array = field(compare=False)
-    curl: float  # of the normals; 0 is a surface
+    curl: float  # of the normals; 0 for a surface
     # mean cosine between normals and the outward direction at the outline; NaN without a closed
     # outline
     rim: float
     is_order: bool = False  # whether it is another order of the lights
-    steps: int = 0  # by how many lights it shifts the order
-    advantage: float = 0.0  # evidence for it against the given lights; from 1 it is better
+    steps: int = 0  # number of lights by which it shifts the order
+    advantage: float = 0.0  # over the given lights; from 1 on, it is better
 
 
 @dataclass(frozen=True)
 class LightCheck:
     """The result of comparing the light directions with the images."""
 
-    # readings of the light file; the given one first, then from best to worst
+    # readings of the light file: the given one, then the others from best to worst
     candidates: tuple[Candidate, ...]
-    # a reading of the order that fits better, in words, or UNKNOWN_ORDER; None if the given one
-    # fits
+    # an order that fits better, in words, or UNKNOWN_ORDER; None if the given order fits
     order: str | None
-    # residual in the given order, as a share of random orders'; NaN with too few lights
+    # misfit of the given order, relative to random orders; NaN if there are too few lights
     given_misfit: float
-    order_misfit: float  # the same in the better order
-    # the reading that gives better normals, if any. Its frame is relative to the given one
+    order_misfit: float  # the same for the better order
+    # the reading that gives better normals, if any
     best: Candidate | None
-    tried: tuple[tuple[str, float], ...]  # readings of the order in words, each with its residual
+    tried: tuple[tuple[str, float], ...]  # readings of the order in words, and their misfits
     outline_counts: float  # the weight of the normals at the mask's edge, from 0 to 1
-    # (F, 3), in the best reading; None for the given one, or if none clearly is best
+    # (F, 3), lights in the best reading; None if this is the given one, or if it is not clear
     mended: Float64Array | None
-    # median angle by which the given lights change the normals, if `best` is right
+    # median angle between the normals under the given and under the better lights
     error_deg: float | None = None
     shadows_tell: bool = False  # whether cast shadows exclude the given lights with x and y negated
-    # whether they contradict the given lights, without supporting others
+    # whether cast shadows contradict the given lights without supporting others
     lacks_shadows: bool = False
-    residual: float = 0.0  # what three images leave of all others, as a share of the brightness
-    # an image that contradicts the others, without which all this was found
+    residual: float = 0.0  # of explaining all images by three, as a share of the brightness
+    # an image that contradicts the others and was left out of the comparison
     odd_image: OddImage | None = None
     in_ring: bool = False  # whether all lights have the same elevation
 
@@ -138,11 +137,10 @@ def check_lights(
     names: Sequence[str] | None = None,
     factors: Factors | None = None,
 ) -> LightCheck:
-    """Compare observations (P, F) of a mask (H, W) with their lights, the `indices` of
-    light_directions (N, 3).
+    """Return the result of comparing observations (P, F) in a mask (H, W) with their lights.
 
-    `names` are the names of the F images, for the texts of the result, and `factors` is
-    find_factors(observations).
+    The lights are the rows `indices` of light_directions (N, 3), all if None. `names` are the names
+    of the F images, for messages, and `factors` is find_factors(observations).
     """
     chosen = np.arange(len(light_directions)) if indices is None else np.asarray(indices)
     names = [str(index + 1) for index in chosen] if names is None else names
@@ -176,8 +174,8 @@ def _check_frame_and_order(
     found = check_order(observations, factors, light_directions, chosen, names)
     observations = observations / found.intensities
     normals = rough_normals(observations, found.lights, mask)
-    # The share of steep pixels at the rim below which the mask's edge is not an outline, and from
-    # which it fully is.
+    # The mask's edge is not an outline if less than 30 % of the pixels at the rim are steep, and
+    # fully is one from 60 % on.
     weight = (
         float(np.clip((normals.rim_steepness - 0.3) / (0.6 - 0.3), 0, 1))
         if found.plausible
@@ -201,7 +199,7 @@ def _check_frame_and_order(
     ]
     others += [candidate(name, None, matrix) for name, matrix in _rotations(normals)]
     judged = [replace(other, advantage=_advantage(other, given, weight)) for other in others]
-    # If no order fits, the normals are not evidence.
+    # If no order fits, the normals provide no evidence.
     fits = found.order != UNKNOWN_ORDER and bool(np.isfinite(given.curl))
     shadows_tell = lacks_shadows = False
     if fits:
@@ -226,7 +224,7 @@ def _check_frame_and_order(
     lights = light_directions[chosen]
     if order == UNKNOWN_ORDER:
         rng = np.random.default_rng(0)
-        # Normals under these random orders are compared with those under the given one.
+        # The normals under random orders are compared with the normals under the given one.
         orders = [rng.permutation(lights) for _ in range(3)]
         turn_deg = float(
             np.median([median_turn_deg(observations, lights, others) for others in orders])
@@ -234,7 +232,7 @@ def _check_frame_and_order(
     elif mended is not None:
         turn_deg = median_turn_deg(observations, lights, mended)
     if order is not None and best is not None and best.is_order:
-        order, best = best.name, None  # one of several orders that fit, chosen by the normals
+        order, best = best.name, None  # several orders fit, and the normals select one
     check = LightCheck(
         (given, *ranked), order, found.given_misfit, found.misfit, best, found.tried, weight, None
     )
@@ -252,12 +250,12 @@ def _check_frame_and_order(
 
 
 def _rotations(normals: RoughNormals) -> Iterator[tuple[str, Float64Array]]:
-    """Yield rotations of the lights about the view axis after which the normals have the least
-    curl, in words.
+    """Yield the rotations of the lights about the view axis that minimise the curl of the normals,
+    each in words and as a matrix (3, 3).
     """
     for mirrored in (False, True):
         least_deg = normals.least_curl_deg(mirrored=mirrored)
-        # Smaller rotations from the nearest frame are errors of a calibration.
+        # A smaller rotation from the nearest frame is a calibration error.
         if np.isnan(least_deg) or abs((least_deg + 45) % 90 - 45) < 10:
             continue
         for degrees in (least_deg, least_deg - np.copysign(180, least_deg)):
@@ -272,11 +270,11 @@ def _rotations(normals: RoughNormals) -> Iterator[tuple[str, Float64Array]]:
 def _by_shadows(
     judged: list[Candidate], given: Candidate, check: ShadowCheck
 ) -> tuple[list[Candidate], bool, bool]:
-    """Return candidates after cast shadows separated the given reading and the best other one from
-    their twins.
+    """Return the candidates with cast shadows included in the advantages of two of them: the given
+    reading and the best other one, each with x and y also negated.
 
-    Also return whether shadows exclude the given lights with x and y negated, and whether the given
-    lights lack some.
+    Also return whether shadows exclude the given lights with x and y negated, and whether shadows
+    are missing under the given lights.
     """
     best, told = max(judged, key=lambda other: other.advantage), {}
     shadows, of_negated = check.shadows(given.matrix)
@@ -304,8 +302,8 @@ def _negated(candidates: Iterable[Candidate], one: Candidate) -> Candidate | Non
 
 
 def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
-    # Among near equals, a frame is preferred, or with `in_order` another order, because the order
-    # is known to be wrong.
+    # Among near equals, prefer a frame or, with `in_order`, another order, because the order is
+    # known to be wrong.
     better = [candidate for candidate in ranked if candidate.advantage >= 1]
     simple = [
         candidate for candidate in better if candidate.frame is not None or candidate.is_order
@@ -321,7 +319,7 @@ def _best(ranked: list[Candidate], *, in_order: bool) -> Candidate | None:
 
 
 def _advantage(other: Candidate, given: Candidate, weight: float) -> float:
-    lowest = 0.1  # less curl is noise; on a spherical cap, other frames give little more
+    lowest = 0.1  # less curl is noise; other frames give little more on a spherical cap
     curls = np.log(max(given.curl, lowest) / max(other.curl, lowest))
     rims = weight * (other.rim - given.rim)
     return float(5.0 * np.nan_to_num(curls) + _RIM_WEIGHT * np.nan_to_num(rims))
@@ -340,9 +338,9 @@ def mirror_twin(check: LightCheck, best: Candidate) -> Candidate | None:
 
 
 def candidate_rows(check: LightCheck) -> list[dict[str, Any]]:
-    """Return the compared readings of a light file as JSON values; undetermined values are null.
+    """Return the compared readings of a light file as JSON values, with null for unknown values.
 
-    Frames come first, then orders, which are judged by their residual alone.
+    Frames come first, then orders, which are judged by their misfit alone.
     """
     readings = [
         (each.name, check.order_misfit, each.curl, each.rim, each.advantage)
@@ -365,11 +363,12 @@ WRITES_MENDED = "`splinecli info CAPTURE --mended-lights FILE`"
 def light_warnings(
     check: LightCheck, light_file: Path, frame: LightFrame, strict: bool
 ) -> list[tuple[CaptureWarning, str]]:
-    """Return the warnings about lights of a file that was read in a frame, which the advice
-    replaces; each with its cause in a sentence if `check.mended` mends it, or "".
+    """Return the warnings about the lights of a file, each with a sentence about its cause, or ""
+    if `check.mended` does not correct it.
 
-    If `strict`, also warn of properties that the images leave undetermined, which is the case for
-    most reliefs without an outline. Each warning states the error of the normals.
+    `frame` is the frame in which the file was read, from which the advice follows. If `strict`,
+    also warn of properties that the images leave undetermined, as most reliefs without an outline
+    do. Each warning includes the error of the normals.
     """
     found = []
 
@@ -387,11 +386,11 @@ def light_warnings(
         text = (
             f"Under the lights of {light_file.name}, the surface should cast shadows that are not"
             " in the images. With x and y of the lights negated, bumps become hollows, and fewer"
-            " shadows are missing. The images do not determine which is right. Compare bumps and"
+            " shadows are missing. The images do not determine which is right, so compare bumps and"
             " hollows with the object. If they are exchanged, negate x and y of the lights."
         )
-        # A bump looks the same as a hollow. With this error, less than half of the normals are
-        # expected within 5 degrees.
+        # A bump and a hollow look the same. With this error, less than half of the normals are
+        # expected to be within 5 degrees.
         found.append((CaptureWarning(codes.LIGHTS_UNCHECKED, text, 6.0), ""))
     if strict and check.unchecked:
         text = (
@@ -408,24 +407,26 @@ def _order_words(check: LightCheck, light_file: Path) -> tuple[str, str]:
     if check.order == UNKNOWN_ORDER:
         cause = (
             f"The images fit {light_file.name} no better than lights in a random order (misfit"
-            f" {given:.0f} % of a random order's)."
+            f" relative to random orders: {given:.0f} %)."
         )
         advice = "Its lines are not in the order of the images, or it belongs to another capture."
         return cause, advice
     advice = "Check that its lines are in the order of the images."
     if check.order == ZENITH:
-        advice = "Replace each elevation by 90 degrees minus it."
+        advice = "Replace each elevation with 90 degrees minus its value."
     elif check.order == HALF_VECTORS:
-        advice = f"Double the angle of each light from the camera axis, as {WRITES_MENDED} does."
+        advice = (
+            f"Double the angle between each light and the camera axis, as {WRITES_MENDED} does."
+        )
         if check.order_misfit > HALF_LEFT * check.given_misfit:  # a ring, recognised by the albedo
             cause = (
                 f"{light_file.name} probably contains half vectors, half-way between the lights"
-                " and the camera axis: under them, steep slopes look brighter."
+                " and the camera axis, because they make the albedo of steep slopes too bright."
             )
             return cause, advice
     cause = (
-        f"The images fit the lights of {light_file.name} much better {check.order} (misfit"
-        f" {100 * check.order_misfit:.0f} % of a random order's, against {given:.0f} %)."
+        f"The images fit the lights of {light_file.name} much better {check.order} (misfit relative"
+        f" to random orders: {100 * check.order_misfit:.0f} % instead of {given:.0f} %)."
     )
     return cause, advice
 
@@ -439,7 +440,7 @@ def _frame_words(
         ("outline", best.rim, check.given.rim, "+.2f"),
     )
     figures = [
-        f"{name} {one:{form}} against {other:{form}}"
+        f"{name} {one:{form}} instead of {other:{form}}"
         for name, one, other, form in pairs
         if f"{one:{form}}" != f"{other:{form}}"
     ]
@@ -454,7 +455,7 @@ def _frame_words(
     if best.is_order:
         return cause, f"Check that the lines of {light_file.name} are in the order of the images."
     which = (
-        "They exchange bumps and hollows; without a closed outline, only the object itself shows"
+        "They differ in bumps and hollows; without a closed outline, only the object itself shows"
         " which is right."
     )
     if best.frame is None:

@@ -1,4 +1,4 @@
-"""The ordered steps from the stored pixels of a capture to trusted observations."""
+"""The steps that turn the stored pixels of a capture into reliable observations."""
 
 from splinecli.recipe.steps import prepare_capture, read_capture
 from splinecli.recipe.work import RecipeOptions

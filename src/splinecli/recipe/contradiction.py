@@ -1,14 +1,14 @@
-"""Given lights that contradict the images, according to the network that estimates normals.
+"""Detect given lights that contradict the images, with the network that estimates normals.
 
-Under wrong lights the network expects larger errors, and its normals do not fit a surface (see
-estimate/light_descent.py). A tilt, another frame, wrong elevations or another order of the lights
-are one fact to this witness: some steps of its descent show whether better lights are near. If so,
-lights are estimated from the images alone (lights/unknown_lights.py), and compared with the given
-ones. If values are wrong, for example under near lamps, the cost also falls under other lights, so
-the threshold is higher where another warning doubts them.
+Under wrong lights, the network expects larger errors, and its normals do not fit a surface (see
+estimate/light_descent.py). A few steps of a descent show whether better lights are near, whether
+the given ones are tilted or have a wrong frame, order or elevation. If so, lights are estimated
+from the images alone (lights/unknown_lights.py) and compared with the given ones. If the values are
+wrong, for example under near lamps, the cost also falls under other lights, so the threshold is
+higher if another warning doubts the values.
 
-The thresholds were chosen on rendered captures (benchmarks/judgement.py). On draws of seven
-photographed objects, whose lights were measured, the cost falls by 0.4 at most.
+The thresholds were chosen on rendered captures (benchmarks/judgement.py). On draws from seven
+photographed objects with measured lights, the cost falls by at most 0.4.
 """
 
 from splinecli.judge.checks import Finding, Judgement, Remedy
@@ -25,15 +25,17 @@ from splinecli.records.capture_warnings import (
     CaptureWarning,
 )
 
-# falls of the cost: from which lights are estimated, which lowers the confidence, which is clear,
-# and which is clear although values were doubted
+# decreases of the cost from which lights are estimated, the confidence is lowered, the fault is
+# clear, and the fault is clear even if the values are doubted
 _DOUBT, _UNCERTAIN, _CLEAR, _ANYWAY = 0.5, 0.8, 1.2, 2.0
-_LARGEST_ERROR_DEG, _TIMES = 12.0, 2.0  # of estimated lights, and how far away the given ones are
+# of estimated lights, and the least angle from the given lights in units of their error
+_LARGEST_ERROR_DEG, _TIMES = 12.0, 2.0
 
 
 def ask_network(work: Work, judgement: Judgement) -> Judgement:
-    """Return the judgement after the network compared the given lights with others. Lights that
-    were estimated, near lamps, and captures that are mended anyway are not compared.
+    """Return the judgement after the network has compared the given lights with others.
+
+    Estimated lights, near lamps, and captures that are corrected anyway are not compared.
 
     Raises ModelError.
     """
@@ -48,7 +50,7 @@ def ask_network(work: Work, judgement: Judgement) -> Judgement:
     known = capture.estimated_intensities is None
     witness = LightWitness.of(values, capture.mask, given)
     if any(each.kind is ROUGH_LIGHTS for each in judgement.warnings):
-        # A matte model also refines lights to fit gloss or fabric, which the network knows.
+        # A matte model may also have refined the lights to fit gloss or fabric, unlike the network.
         refined = refine_lights(values, given)
         if refined is None or witness.cost(given) - witness.cost(refined.directions) < _UNCERTAIN:
             kept = [each for each in judgement.warnings if each.kind is not ROUGH_LIGHTS]
@@ -62,13 +64,16 @@ def ask_network(work: Work, judgement: Judgement) -> Judgement:
     others = [each for each in judgement.warnings if each.kind not in FAULTS_OF_LIGHTS]
     least = _ANYWAY if any(each.is_error for each in others) else _CLEAR
     if any(each.kind is ELEVATION_SUSPECTED for each in judgement.warnings):
-        least = _UNCERTAIN  # another witness
+        least = _UNCERTAIN  # independent evidence
     if of_found > least and stated < _LARGEST_ERROR_DEG and apart > _TIMES * stated:
         cause = (
-            f"The lights of {work.source.lights_file.name} contradict the images, which fit lights"
-            f" that are {apart:.0f} degrees away on average, and known to {stated:.0f} degrees."
+            f"The lights of {work.source.lights_file.name} contradict the images, which fit other"
+            f" lights, {apart:.0f} degrees away on average, with an expected error of {stated:.0f}"
+            " degrees."
         )
-        text = f"{cause} Check their frame, order and elevations; {WRITES_MENDED} writes those."
+        text = (
+            f"{cause} Check their frame, order and elevations; {WRITES_MENDED} writes the others."
+        )
         warning = CaptureWarning(LIGHTS_CONTRADICTED, text, float(apart))
         finding = Finding(warning, clear=True, cause=cause)
         remedy = Remedy((finding,), found.directions, light_error_deg=float(stated))
@@ -79,7 +84,7 @@ def ask_network(work: Work, judgement: Judgement) -> Judgement:
         text = (
             f"Under lights that differ by {moved_deg:.0f} degrees on average, the network expects"
             " smaller errors and finds a better surface. The given lights may be inaccurate, or the"
-            " material is unusual; the confidence is lowered."
+            " material unusual, so the confidence is lowered."
         )
         warning = CaptureWarning(LIGHTS_UNCERTAIN, text, moved_deg / 2)
         return judgement._replace(warnings=(*judgement.warnings, warning))

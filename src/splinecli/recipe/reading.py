@@ -1,4 +1,4 @@
-"""Read the images of a capture: observations, saturated ones, and faults of the exposure."""
+"""Read the images of a capture, and report saturation and faults of the exposure."""
 
 from __future__ import annotations
 
@@ -20,44 +20,44 @@ from splinecli.maths.pixel_grid import slices
 from splinecli.records import capture_warnings as codes
 from splinecli.records.capture_warnings import CaptureWarning
 
-# an image is dark if its 99 % quantile is below this share of the white level
+# An image is dark if its 99th percentile is below this share of the white level.
 DARK = {"uint8": 0.25, "uint16": 0.05}
-# Degrees that rounding to 8 bits costs at most, times the part of the range that is used. Measured
-# with spline-net on ten captures, rendered and real, with ten lights: 0.2 degrees if the range is
-# used, 0.4 for half of it, 1.4 for 20 %, 3.3 for 10 %, 6.7 for 5 %.
+# Largest error from rounding to 8 bits, in degrees, times the share of the range that is used.
+# Measured with spline-net on ten rendered and real captures with ten lights: 0.2 degrees if the
+# whole range is used, 0.4 for half of it, 1.4 for 20 %, 3.3 for 10 %, 6.7 for 5 %.
 _COST_OF_8_BITS = 0.32
-MOSTLY_SATURATED = 0.2  # share of an image's pixels from which it is named
-_ENOUGH = 1_000_000  # values for a quantile: its rank is uncertain by 0.01 % of the pixels
+MOSTLY_SATURATED = 0.2  # an image is named if a larger share of its pixels is saturated
+_ENOUGH = 1_000_000  # values for a quantile, so that its rank is accurate to 0.01 % of the pixels
 
 
 @dataclass(frozen=True)
 class ImageSummary:
-    """One image of a capture; only the mask's pixels are used."""
+    """The summary of an image, computed from the pixels in the mask."""
 
     path: Path
     channels: int  # as stored
     dtype: str  # as stored, such as "uint16"
-    # the 99 % quantile of the values, as a share of the white level if they are integers
+    # 99th percentile of the values, as a share of the white level if they are integers
     bright: float
-    saturated: float = 0.0  # share of the pixels with a channel at the white level or above
+    saturated: float = 0.0  # share of the pixels with a channel at or above the white level
 
 
 class Observed(NamedTuple):
-    """What was read from the images of a capture."""
+    """The data read from the images of a capture."""
 
-    observations: Float32Array  # (P + R, F), of the mask's pixels, then of those around it
+    observations: Float32Array  # (P + R, F), of the pixels in the mask, then around it
     saturation: Saturation
     images: tuple[ImageSummary, ...]
     colours: Float32Array | None  # (F, p, 3), linear RGB of some pixels; None for gray images
 
 
 def compared_pixels(n_pixels: int) -> Integers:
-    """Return the rows (p,) of pixels whose colours are compared, among those of a mask."""
+    """Return the rows (p,) of the pixels in a mask whose colours are compared."""
     return np.linspace(0, n_pixels - 1, min(n_pixels, COLOUR_SAMPLE)).astype(np.intp)
 
 
 class Look(NamedTuple):
-    """What is kept of one image."""
+    """The data kept from one image."""
 
     saturated: ImageValues
     summary: ImageSummary
@@ -66,8 +66,9 @@ class Look(NamedTuple):
 
 
 def look_at_image(compared: Integers, white_level: float | None, image: StoredPixels) -> Look:
-    """Return the observations and the values of an image. Raises InputError if the given white
-    level is above its full scale.
+    """Return the observations and the summary of an image.
+
+    Raises InputError if the given white level is above the full scale of the image.
     """
     colours = replace(image, count=len(compared), light=lambda rows: image.light(compared[rows]))
     return Look(
@@ -78,13 +79,16 @@ def look_at_image(compared: Integers, white_level: float | None, image: StoredPi
     )
 
 
-_AT_ONCE, _ROWS = 4, 1 << 14  # images and pixels that are placed at once
+_AT_ONCE, _ROWS = 4, 1 << 14  # numbers of images and pixels that are copied at once
 
 
 def gather_observations(
     images: Iterable[Look], n_images: int, mask: Bools, white_level: float | None
 ) -> Observed:
-    """Return the observations of images of a mask (H, W); the white level is None to find it."""
+    """Return the observations of images in a mask (H, W).
+
+    If `white_level` is None, it is found in the images.
+    """
     n_pixels, observations = int(np.count_nonzero(mask)), np.empty((0, n_images), np.float32)
     looks, waiting = list[Look](), list[Float32Array]()
     for position, look in enumerate(images, 1):
@@ -93,7 +97,7 @@ def gather_observations(
         if position == 1:
             observations = np.empty((len(look.observations), n_images), np.float32)
         del look
-        # Writing every column on its own would pass through the whole array for each image.
+        # Writing one column at a time would pass through the whole array for each image.
         if len(waiting) == _AT_ONCE or position == n_images:
             for rows in slices(len(observations), _ROWS):
                 for column, each in enumerate(waiting, position - len(waiting)):
@@ -114,7 +118,7 @@ _NOTHING = np.empty(0, np.float32)
 
 @lru_cache(maxsize=1)
 def _enough_rows(n_pixels: int) -> Integers:
-    # at random: pixels at equal distances may be in a few columns
+    # at random, because equally spaced pixels may be in only a few columns
     return np.random.default_rng(0).integers(n_pixels, size=_ENOUGH)
 
 
@@ -128,7 +132,7 @@ def _summarise(image: StoredPixels) -> ImageSummary:
 
 
 def _quantile(stored: Array, path: Path, share: float) -> Float32Array:
-    """Return a quantile of stored values, on the scale of to_linear."""
+    """Return a quantile of stored values, as scaled by to_linear."""
     if stored.dtype.kind != "u":
         return np.asarray(np.quantile(to_linear(stored, path), share), np.float32)
     up_to = np.bincount(stored.reshape(-1)).cumsum()
@@ -139,19 +143,22 @@ def _quantile(stored: Array, path: Path, share: float) -> Float32Array:
 
 
 def _relative(images: Sequence[ImageSummary], saturation: Saturation) -> Iterable[ImageSummary]:
-    """Yield the images relative to the white level, with their shares of saturated pixels."""
+    """Yield the summaries relative to the white level, with shares of saturated pixels."""
     level = saturation.white_level
     for image, n_saturated in zip(images, saturation.n_saturated.tolist(), strict=True):
         full_scale = np.iinfo(image.dtype).max if image.dtype.startswith("uint") else 0
         bright = image.bright
-        # The white level of 16-bit images does not apply to 8-bit images among them.
+        # The white level of 16-bit images does not apply to any 8-bit images among them.
         if level is not None and full_scale >= level.value:
             bright *= full_scale / level.value
         yield replace(image, bright=bright, saturated=n_saturated / max(saturation.n_pixels, 1))
 
 
 def exposure_warnings(observed: Observed, *, inverted: bool) -> list[CaptureWarning]:
-    """Warn about faults of the exposure. `inverted` is whether the mask is probably inverted."""
+    """Return warnings about faults of the exposure.
+
+    `inverted` says whether the mask is probably inverted.
+    """
     saturation, n_pixels = observed.saturation, observed.saturation.n_pixels
     n_images = len(observed.images)
     warnings = white_level_warnings(saturation.white_level)
@@ -162,7 +169,7 @@ def exposure_warnings(observed: Observed, *, inverted: bool) -> list[CaptureWarn
         if worst.saturated > MOSTLY_SATURATED:
             most = f", most of them in {worst.path.name} ({100 * worst.saturated:.1f} %)"
         text = (
-            f"{100 * saturated:.1f} % of the observations are saturated{most}; a shorter exposure"
+            f"{100 * saturated:.1f} % of the observations are saturated{most}. A shorter exposure"
             " gives better normals."
         )
         warnings.append(CaptureWarning(codes.SATURATED, text))
@@ -170,7 +177,7 @@ def exposure_warnings(observed: Observed, *, inverted: bool) -> list[CaptureWarn
     black = (n_pixels - np.count_nonzero(lit)) / max(n_pixels, 1)
     if black > 0.01:
         text = (
-            f"{100 * black:.1f} % of the pixels are black under every light; they get the normal"
+            f"{100 * black:.1f} % of the pixels are black under every light, so they get the normal"
             " (0, 0, 1). Leave them out with a mask or with --auto-mask."
         )
         warnings.append(CaptureWarning(codes.BLACK_PIXELS, text))
@@ -182,7 +189,7 @@ def exposure_warnings(observed: Observed, *, inverted: bool) -> list[CaptureWarn
 
 
 def _eight_bits(images: Sequence[ImageSummary]) -> list[CaptureWarning]:
-    """Warn about images with 8 bits, if there are any."""
+    """Return a warning about images with 8 bits, if there are any."""
     if not images:
         return []
     used = max(0.01, *(image.bright for image in images))
@@ -202,17 +209,17 @@ def _dark_images(dark: Sequence[ImageSummary], observed: Observed) -> CaptureWar
     used = max(image.bright for image in observed.images) * 65_535 / max(level, 1)  # 16-bit files
     if level and used >= DARK["uint16"]:
         text = (
-            f"No value is above {level}, as from a camera of {bits} bits in 16-bit files. Of this"
-            f" range, the images use {100 * min(used, 1):.0f} %. If the camera has {bits} bits,"
-            f" add --white-level {level}; if it has 16, a longer exposure gives less noise."
+            f"No value is above {level}, as in 16-bit files from a {bits}-bit camera. The images"
+            f" use {100 * min(used, 1):.0f} % of this range. If the camera has {bits} bits, add"
+            f" --white-level {level}; if it has 16, use a longer exposure for less noise."
         )
         return CaptureWarning(codes.WHITE_LEVEL, text)
     most = max(DARK[image.dtype] for image in dark)
     text = (
-        f"Images that use less than {100 * most:.0f} % of the range: {len(dark)}, such as"
-        f" {dark[0].path.name}; a longer exposure gives less noise"
+        f"{len(dark)} of {len(observed.images)} images use less than {100 * most:.0f} % of the"
+        f" range, such as {dark[0].path.name}. A longer exposure gives less noise"
     )
-    # One dark image among others may have been stored in another way.
+    # A few dark images may have been stored with another bit depth.
     few = len(dark) <= len(observed.images) / 2
-    text += ", if it has the same bit depth as the others." if few else "."
+    text += ", if they have the same bit depth as the others." if few else "."
     return CaptureWarning(codes.DARK_IMAGES, text)

@@ -1,10 +1,10 @@
-"""The recipe: how the stored pixels of a capture become trusted observations, step by step.
+"""The recipe, which turns the stored pixels of a capture into reliable observations step by step.
 
     mask -> colours of the lamps -> registration -> mask of the aligned images -> observations,
     without lens blur -> lights -> intensities -> saturation -> judgement -> refined lights
 
-`infer` and `info` follow the table STEPS. `evaluate` reads the observations once, and each trial
-enters at the lights with the images of its draw. Arrays enter at the observations. Nothing else
+`infer` and `info` follow the table STEPS. `evaluate` reads the observations once; each trial then
+starts at the lights, with the images of its draw. Arrays start at the observations. No other code
 prepares images.
 """
 
@@ -62,14 +62,14 @@ Advance = Callable[[float, str], object]  # called after each image, with 1 and 
 
 
 def find_colours(work: Work, advance: Callable[[], object]) -> Work:
-    """Find the colours of the lamps before the registration, which compares images."""
+    """Find the colours of the lamps before registration, which compares images."""
     return _with_colours(work, *compare_colours(work.files, work.indices, advance))
 
 
 def _with_colours(
     work: Work, colours: Float64Array | None, warnings: Sequence[CaptureWarning]
 ) -> Work:
-    """Return the work whose images are divided by the colours (F, 3) of their lamps."""
+    """Return the work with the images divided by the colours (F, 3) of their lamps."""
     source, found = work.source.divided_by(work.indices, colours), (*work.warnings, *warnings)
     return replace(work, source=source, colours=colours, colours_known=True, warnings=found)
 
@@ -77,7 +77,7 @@ def _with_colours(
 def find_mask(work: Work, advance: Callable[[], object]) -> Work:
     """Find the object in all images of the source; see find_object.
 
-    Raises InputError if no object stands out, and the mask was requested.
+    Raises InputError if the mask was requested, but no object stands out.
     """
     source = work.files
     shape = common_size(source.facts)[0][:2]  # of all images
@@ -98,10 +98,10 @@ def find_mask(work: Work, advance: Callable[[], object]) -> Work:
 
 
 def observe(work: Work, advance: Callable[[], object]) -> Work:
-    """Read the images, and remove the blur of the lens.
+    """Read the images and remove lens blur.
 
-    If the lamps turn out to have different colours, the images are read again, because only the
-    mean of their channels was kept.
+    If the lamps have different colours, the images are read again, because only the mean of their
+    channels was kept.
 
     Raises:
         UsageError: the indices of the images are not valid.
@@ -157,8 +157,8 @@ def observe(work: Work, advance: Callable[[], object]) -> Work:
 def find_lights(work: Work, _: Callable[[], object]) -> Work:
     """Estimate the light directions from the observations.
 
-    Raises InputError if the images do not determine the lights, or the estimated lights cannot give
-    normals.
+    Raises InputError if the images do not determine the lights, or if normals cannot be estimated
+    under the lights found.
     """
     from splinecli.estimate.light_descent import best_lights
     from splinecli.lights.unknown_lights import find_lights
@@ -193,7 +193,7 @@ def find_lights(work: Work, _: Callable[[], object]) -> Work:
 
 
 def divide_by_intensities(work: Work, _: Callable[[], object]) -> Work:
-    """Divide by light intensities that are estimated from all pixels, where none are known."""
+    """Divide by light intensities, estimated from all pixels, if they are unknown."""
     capture, intensities = work.made, work.found_intensities
     if intensities is None and not work.source.intensities_known:
         intensities = estimate_light_intensities(
@@ -205,8 +205,8 @@ def divide_by_intensities(work: Work, _: Callable[[], object]) -> Work:
     digits = 4 if f"{lowest:.2f}" == f"{highest:.2f}" else 2
     extent = f"from {lowest:.{digits}f} to {highest:.{digits}f} times their mean."
     text = (
-        f"The light intensities were estimated from the images: they are unequal, {extent} Use"
-        " --intensities FILE if you have measured them, or --intensities equal to assume equal"
+        f"The light intensities were estimated from the images, because they are unequal: {extent}"
+        " Use --intensities FILE if you have measured them, or --intensities equal to assume equal"
         " ones."
     )
     again = f"The light intensities were estimated: {extent}"
@@ -240,16 +240,17 @@ def judge(work: Work, _: Callable[[], object]) -> Work:
 
 
 def mend(work: Work, _: Callable[[], object]) -> Work:
-    """Read the capture again as the faults that are clear demand, apart from values that options
-    give; keep it as it is if the images then contradict it in another way.
+    """Read the capture again with its clear faults corrected, except values set by options.
+
+    The capture is left as it is if a correction causes another contradiction with the images.
     """
     judgement, source, options = work.judgement, work.source, replace(work.options, mends=False)
-    assert judgement is not None and judgement.remedy is not None  # the step is wanted
+    assert judgement is not None and judgement.remedy is not None  # see _mends
     remedy, notes, mended_kinds = judgement.remedy, list[CaptureWarning](), set[WarningKind]()
     files = source if isinstance(source, CaptureSource) else None
 
     def causes(*kinds: WarningKind) -> str:
-        """Return the causes of the faults of these kinds, which are mended."""
+        """Return the causes of the faults of these kinds, and count the kinds as corrected."""
         mended_kinds.update(kinds)
         return " ".join(each.cause for each in remedy.faults if each.warning.kind in kinds)
 
@@ -297,7 +298,7 @@ def mend(work: Work, _: Callable[[], object]) -> Work:
 
 
 def _without_align(work: Work) -> Work:
-    """Return the work whose warnings do not advise to align, because that was tried in vain."""
+    """Return the work without the advice to align in its warnings, because aligning has failed."""
     assert work.judgement is not None
     warnings = tuple(
         replace(each, text=each.text.replace(ALIGN_ADVICE, "Photograph from a tripod."))
@@ -314,7 +315,7 @@ def refine(work: Work, _: Callable[[], object]) -> Work:
 
 
 def _compares_colours(work: Work) -> bool:
-    """Whether the colours of the lamps may differ, and were not compared yet."""
+    """Return whether the lamps may differ in colour and have not been compared yet."""
     return work.source.lamps_may_differ and not (work.colours_known or work.options.as_stored)
 
 
@@ -328,7 +329,7 @@ def _finds_mask(work: Work) -> bool:
 
 
 def _needs_outline(work: Work) -> bool:
-    """Whether a mask is tried, because the outline helps to estimate lights."""
+    """Return whether to look for a mask, because the outline helps to estimate the lights."""
     return work.finds_lights and work.options.refuses_lights
 
 
@@ -347,8 +348,8 @@ class Step:
     name: str
     run: Callable[[Work, Callable[[], object]], Work]
     is_wanted: Callable[[Work], bool] = lambda work: True
-    n_images: Callable[[Work], int] = lambda work: 0  # that it reads
-    note: str = ""  # beside the progress of these
+    n_images: Callable[[Work], int] = lambda work: 0  # number of images that it reads
+    note: str = ""  # beside their progress
 
 
 STEPS = (
@@ -385,7 +386,7 @@ def follow(
     last: str = STEPS[-1].name,
     advance: Advance = lambda amount, note: None,
 ) -> Work:
-    """Return the work after the steps from `first` to `last` that it needs."""
+    """Return the work after those steps from `first` to `last` that it needs."""
     for step in STEPS[_PLACES[first] : _PLACES[last] + 1]:
         if step.is_wanted(work):
             work = step.run(work, lambda note=step.note: advance(1, note))  # type: ignore[misc]
@@ -393,16 +394,16 @@ def follow(
 
 
 def images_to_read(work: Work) -> int:
-    """Return how many images the recipe reads, counting an image again each time."""
+    """Return the number of images that the recipe reads, counting an image each time it is read."""
     return sum(step.n_images(work) for step in STEPS if step.is_wanted(work))
 
 
 def begin(
     source: Source, light_indices: Sequence[int] | None = None, options: RecipeOptions = USUAL
 ) -> Work:
-    """Return the work on the images of these lights (None for all), before the first step.
+    """Return the work on the images of the chosen lights (None for all) before the first step.
 
-    Raises UsageError if an index is out of range or repeated, or there are fewer than three.
+    Raises UsageError if an index is out of range or repeated, or if there are fewer than three.
     """
     every = tuple(range(source.n_lights))
     indices = every if light_indices is None else check_light_indices(light_indices, len(every))
@@ -440,7 +441,7 @@ def read_capture(
     light_indices: Sequence[int] | None = None,
     as_stored: bool = False,
 ) -> Capture:
-    """Open a capture with open_capture and read it with prepare_capture.
+    """Return the capture in a folder, opened with open_capture and read with prepare_capture.
 
     Examples:
         >>> from splinecli.recipe import read_capture

@@ -20,27 +20,27 @@ from splinecli.records.capture_warnings import CaptureWarning
 
 @dataclass(frozen=True)
 class RecipeOptions:
-    """What the user wants of the recipe."""
+    """The options of the recipe."""
 
-    # Use the stored values: keep lens blur, colours of lamps and saturated pixels, and estimate no
-    # intensities.
+    # use the stored values: keep lens blur, lamp colours and saturated pixels, and do not estimate
+    # intensities
     as_stored: bool = False
     auto_mask: bool = False  # if there is no mask, find the object in the images
     align: bool = False  # align images that moved between exposures
     finds_lights: bool = False  # estimate the light directions from the images
-    first_light: str | None = None  # the side from which the first of these lights comes
+    first_light: str | None = None  # side that the first of these lights comes from
     refuses_lights: bool = True  # raise InputError for lights that the images do not determine
     judges: bool = True  # check lights and images against each other
     asks_network: bool = False  # compare given lights with others; see contradiction.py
-    mends: bool = False  # mend faults that are clear
-    keeps_lights: bool = False  # also faults of the lights, whose frame the user gave
+    mends: bool = False  # correct clear faults
+    keeps_lights: bool = False  # except those of the lights, because the user gave their frame
     strict: bool = False  # also warn of properties that the images leave undetermined
     refine_lights: bool = False  # refine rough light directions
-    light_error_deg: float | None = None  # the usual error of these; None for the default
+    light_error_deg: float | None = None  # their typical error; None for the default
 
     @property
     def mends_lights(self) -> bool:
-        """Whether clear faults of the lights are mended."""
+        """Whether clear faults of the lights are corrected."""
         return self.mends and not self.keeps_lights
 
 
@@ -49,13 +49,12 @@ USUAL = RecipeOptions()
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """A source on its way to a capture: each step of the recipe returns another one.
+    """A source on its way to a capture. Each step of the recipe returns a new one.
 
-    source: with the mask, the motion and the colours of the lamps once they are found.
-    indices: the images that are used, in their order.
-    colours: (F, 3), the colours of the lamps that the source's intensities contain; None if there
-    are none. colours_known: whether the images were already compared to find these. warnings: of
-    the steps before the capture exists. capture, saturation, images: set by the step
+    source: includes the mask, the motion and the lamp colours once they are found. indices: the
+    images that are used, in order. colours: (F, 3), estimated lamp colours included in the source's
+    intensities, or None. colours_known: whether the images have already been compared to find them.
+    warnings: from the steps before the capture exists. capture, saturation, images: set by the step
     `observations`. found_intensities: (F,), estimated together with the lights, or None. judgement:
     set by the step of this name.
     """
@@ -74,20 +73,20 @@ class Work:
 
     @property
     def finds_lights(self) -> bool:
-        """Whether the lights are estimated from the images: because this was requested, or because
-        the capture has no light file.
+        """Whether the lights are estimated from the images, because this was requested or the
+        capture has no light file.
         """
         return self.options.finds_lights or not self.source.has_lights
 
     @property
     def made(self) -> Capture:
-        """The capture, which exists once the step `observations` was run."""
+        """The capture, which exists after the step `observations`."""
         assert self.capture is not None
         return self.capture
 
     @property
     def saturated(self) -> Saturation:
-        """The saturated observations of the capture."""
+        """The saturated observations, which are known after the step `observations`."""
         assert self.saturation is not None
         return self.saturation
 
@@ -100,11 +99,13 @@ class Work:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Height and width of the images that are used. Raises InputError if their sizes differ."""
+        """The height and width of the images that are used. Raises InputError if their sizes
+        differ.
+        """
         return common_size([self.files.facts[index] for index in self.indices])[0][:2]
 
     def choose_images(self, positions: Sequence[int]) -> Work:
-        """Return the work on some of the images, with a capture of its own, from their positions.
+        """Return the work on the images at some positions, with its own capture.
 
         The white level is decided from these images alone, as if only they had been read.
         """
@@ -123,13 +124,13 @@ class Work:
         )
 
     def choose_pixels(self, rows: Integers) -> Work:
-        """Return the work on the pixels with these rising rows of the observations."""
+        """Return the work on the pixels in these rows of the observations, in ascending order."""
         capture = self.made.choose_pixels(rows)
         return replace(self, capture=capture, saturation=self.saturated.choose_pixels(rows))
 
     def lights_of(self, rows: Integers) -> Float64Array:
-        """Return the light vectors of some pixels: (F, 3), or (p, F, 3) with the falloff of near
-        lamps on a plane.
+        """Return the light vectors (F, 3) of some pixels, or (p, F, 3) with the attenuation of near
+        lamps for points on a plane.
         """
         capture = self.made
         if capture.lamps is None:
