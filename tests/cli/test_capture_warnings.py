@@ -199,7 +199,7 @@ def test_twelve_bits_in_files_of_sixteen(run):
     folder = write_capture(Path("twelve"), stored(images, 4095), LIGHTS, mask=mask)
     result = run(
         f"info {folder} --json",
-        says=("as from a camera of 12 bits in 16-bit files", "--white-level 4095"),
+        says=("as in 16-bit files from a 12-bit camera", "--white-level 4095"),
     )
     assert result.json["warning_codes"] == ["white_level"]
     assert codes_of(run, f"{folder} --white-level 4095") == []
@@ -218,7 +218,11 @@ def test_dark_values_of_sixteen_bits_are_dark(run):
         (0.9, "The images have 8 bits, which costs less than 0.5 degrees.", False),
         (0.4, "The images have 8 bits and use 40 % of the range, which costs up to 0.8", False),
         (0.2, "The images have 8 bits and use 20 % of the range, which costs up to 1.6", True),
-        (0.1, "less than 25 % of the range: 10, such as 000.png; a longer exposure", True),
+        (
+            0.1,
+            "10 of 10 images use less than 25 % of the range, such as 000.png. A longer exposure",
+            True,
+        ),
     ],
 )
 def test_what_8_bits_cost_depends_on_the_exposure(run, share, words, is_dark):

@@ -338,7 +338,10 @@ def test_a_full_disk_ends_a_batch(error, capture, make_capture, run, monkeypatch
 
 
 def test_images_in_place_of_their_folder(run, capture):
-    message = "splinecli: 8 images were given, expected their folder. Pass the folder 'sphere'.\n"
+    message = (
+        "splinecli: 8 images were given, expected the folder with the images. Pass the folder"
+        " 'sphere'.\n"
+    )
     run("infer --method ls", *sorted(capture.glob("image*.png")), code=2, err=message)
 
 

@@ -77,7 +77,7 @@ def test_changed_captures_are_kept_or_redone(capture, make_capture, run, reason,
     kept = run(f"{call} {extra}", code=5, out="")
     line = next(line for line in kept.err.splitlines() if "out/sphere: " in line)
     assert reason in line
-    assert "Add --update to redo what changed, --overwrite to redo everything" in line
+    assert "Add --update to redo changed captures, --overwrite to redo everything" in line
     assert (normals.stat().st_mtime_ns, read_report()) == before
     first, *_ = run(f"{call} {extra} --json", code=5).json
     assert (first["capture"], first["exit_code"], reason in first["error"]) == ("sphere", 5, True)
@@ -119,7 +119,7 @@ def test_an_unfinished_folder_is_computed_again(capture, run, name):
     file, damage, reason = UNFINISHED_FOLDERS[name]
     damage(Path("out/sphere", file))
     elsewhere = {path: path.read_bytes() for path in Path().glob("elsewhere")}
-    assert run(call, says=(reason, "so it is computed again")).out[:11] == "out/sphere:"
+    assert run(call, says=(reason, "so the capture is computed again")).out[:11] == "out/sphere:"
     assert names_in("out/sphere") == whole
     assert not any(path.is_symlink() for path in Path("out/sphere").iterdir())
     assert {path: path.read_bytes() for path in elsewhere} == elsewhere

@@ -1,3 +1,3 @@
-"""The command line, which starts in main.py. Only this package uses typer and rich, prints, and
+"""The command line, whose entry point is main.py. No other package uses typer or rich, prints, or
 sets exit codes.
 """

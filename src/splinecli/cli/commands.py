@@ -27,11 +27,11 @@ def calibrate(options: CalibrateOptions) -> None:
     detected in an image named ref, or in the mean of all images. The brightest spot in the ball is
     treated as the reflection of the lamp. Directions of several balls are averaged.
 
-    Writes OUT/light_directions.txt for the option --lights of infer, calibration.png to check the
-    result by eye, and calibration.json. With a gray ball or card, it also writes
+    Writes OUT/light_directions.txt for infer --lights, calibration.png to check the result by eye,
+    and calibration.json. With a gray ball or card, it also writes
     light_intensities.txt, the relative light intensities. If the lamps are near, the camera is
     known, and there are at least two balls or one ball at two places, it also writes
-    light_positions.txt, pixel_size.txt and camera_matrix.txt for --light-positions of infer.
+    light_positions.txt, pixel_size.txt and camera_matrix.txt for infer --light-positions.
     """
     from splinecli.pipeline.calibrate import DIRECTIONS, calibrate_lights
 
@@ -125,7 +125,7 @@ def _print_table(evaluation: Evaluation) -> None:
     for row in cells[1:]:
         table.add_row(*row)
     print(caption(evaluation))
-    # A table that is too wide is better than one that is cut off.
+    # Do not cut off a table that is too wide.
     widest = console.measure(table, options=console.options.update(max_width=10_000)).maximum
     Console(highlight=False, width=max(console.width, widest)).print(table, crop=False)
 
@@ -159,7 +159,7 @@ def prepare(options: PrepareOptions) -> int:
 def import_weights(options: ImportOptions) -> None:
     """Convert the checkpoints of the authors' SPLINE-Net (PyTorch) to a weight file.
 
-    Other commands take the weight file with --weights. Both checkpoints must come from the same
+    Pass the weight file to other commands with --weights. Both checkpoints must come from the same
     training step, such as 200000-G.ckpt and 200000-D.ckpt. Only tensors are read from them; code in
     them is not run.
     """
@@ -183,8 +183,8 @@ def train(options: TrainOptions) -> None:
     """Train LI-Net and NE-Net, or with --preset refine a refinement net.
 
     Without a SET, the pixels are generated during training; a refinement net needs a SET. Writes
-    weights.safetensors, which --weights of other commands takes, checkpoint.safetensors,
-    config.json, metrics.csv, curves.png and maps.png into RUN. After Ctrl-C, --resume continues
+    weights.safetensors (for --weights of other commands), checkpoint.safetensors, config.json,
+    metrics.csv, curves.png and maps.png to RUN. After Ctrl-C, --resume continues
     from the checkpoint. Settings come from the preset, then from --config, then from the other
     options. With torchrun, several processes train together.
     """
@@ -238,8 +238,7 @@ def _run(trainer: Trainer, messages: Messages) -> None:
             nonlocal shown
             advance(progress - shown, _losses(metrics))
             shown = progress
-            # On a terminal, there is a progress bar. Elsewhere, a line is printed with each
-            # checkpoint.
+            # A terminal shows a progress bar. Elsewhere, print a line for each checkpoint.
             if metrics.validation_deg is not None and (progress >= 1 or not sys.stderr.isatty()):
                 messages.say(f"step {metrics.step}, {metrics.pixels} pixels, {_losses(metrics)}")
 

@@ -23,7 +23,7 @@ from splinecli.system.files import as_splinecli_error
 from splinecli.system.machine import is_out_of_memory
 from splinecli.system.progress import Advance, Observer, ignore
 
-# for unexpected errors
+# message of unexpected errors
 DEFECT = "this is a defect of splinecli; please report it with the lines above."
 # The base class of click's usage errors. Typer includes its own copy of click, whose location
 # depends on the version.
@@ -140,7 +140,7 @@ def print_lines(text: str) -> None:
 
 
 class Messages(Observer):
-    """Prints messages on stderr, or nothing with `quiet`.
+    """Prints messages on stderr or, with `quiet`, only errors.
 
     On a terminal, progress is shown as a bar; elsewhere, one line is printed every LINE_SECONDS.
     """
@@ -237,7 +237,7 @@ def _bar(label: str, total: float, start: float, unit: str) -> Iterator[Advance]
         TextColumn("{task.fields[speed]}", markup=False),
         TextColumn("{task.fields[note]}", markup=False),
     )
-    # A summary for a file or a pipe must not be written to the progress bar's stream.
+    # Summaries for a file or a pipe must not be redirected to the progress bar's stream.
     own = sys.stdout.isatty()
     with Progress(
         *columns, console=Console(stderr=True), transient=True, redirect_stdout=own

@@ -179,7 +179,7 @@ def info(reading: ReadingOptions, options: InfoOptions) -> int:
 
     Prints the layout and files of the capture, the size and bit depth of the images, their white
     level and exposure, the angles of the lights from the camera axis, and the memory and time that
-    infer needs. Writes nothing but the plot and the mended lights.
+    infer needs. Writes files only if an option requests them.
     """
     from splinecli.pipeline.info import describe_capture, summary_lines
     from splinecli.records.capture_warnings import PROBABLY_WRONG

@@ -398,7 +398,7 @@ def _apart(stream: TextIO) -> TextIO:
     stream.flush()
     try:
         own = os.fdopen(os.dup(2), "wb", buffering=0)
-    except OSError:  # a limit on open files, which the command will report
+    except OSError:  # too many open files, which the command will report
         return stream
     return io.TextIOWrapper(
         own, stream.encoding, stream.errors, line_buffering=True, write_through=True

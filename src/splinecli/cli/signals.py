@@ -13,9 +13,9 @@ from contextlib import suppress
 from types import FrameType
 
 INTERRUPTED = 130  # exit code of an interrupted process
-# how long the command may take to clean up
+# time that the command has to clean up
 GRACE_SECONDS = {int(signal.SIGTERM): 1.5, int(signal.SIGINT): 5.0}
-# set when the command itself reports the interruption, to avoid a second message
+# set when the command itself reports the interruption, so that it is reported only once
 TOLD = threading.Event()
 DEFERRED = threading.Event()  # set when a signal arrives during an import, which must finish first
 

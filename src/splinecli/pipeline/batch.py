@@ -92,7 +92,7 @@ def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[B
     ):
         given = "an image was" if len(folders) == 1 else f"{len(folders)} images were"
         raise UsageError(
-            f"{given} given, expected their folder",
+            f"{given} given, expected the folder with the images",
             hint=f"Pass the folder {str(folders[0].parent)!r}",
         )
     folders = list({_own_path(folder): folder for folder in reversed(folders)}.values())[::-1]
@@ -197,11 +197,11 @@ def run_member(
         return _failure(member, error)
     if loads_first(options):
         method()
-    with meanwhile(method) as load:  # PyTorch takes a second or two, in which images are read
+    with meanwhile(method) as load:  # read images during the seconds that PyTorch takes to load
         try:
             return Outcome("done", infer_capture(member.folder, options, observer, load=load))
         except Exception as error:
-            load()  # if the method cannot be loaded, this is said instead
+            load()  # an error while loading the method takes precedence
             return _failure(member, error)
 
 
@@ -233,13 +233,13 @@ def _failure(member: BatchItem, error: Exception) -> Outcome:
 def failed(
     name: str, error: SplinecliError, trace: str = "", *, status: Status = "failed"
 ) -> Outcome:
-    """Return the outcome of a capture that has no results of this run."""
+    """Return the outcome of a capture without results from this run."""
     document = {"capture": name, "error": str(error), "exit_code": error.exit_code}
     return Outcome(status, document, error.exit_code, trace)
 
 
 class ChangedError(OutputError):
-    """A folder has results of other input files, other options or another version."""
+    """A folder contains results from other input files, other options or another version."""
 
 
 def find_earlier(
@@ -247,10 +247,10 @@ def find_earlier(
 ) -> dict[str, Any] | None:
     """Return the report in `target` if its results match the capture and the options.
 
-    Return None without results. If an interrupted run left partial results, `warn` receives a
-    sentence about this. Raises ChangedError for results of another capture or other options,
-    InputError, or OutputError if `target` is also the capture's folder, where the user's own files
-    may have the names of results.
+    Return None if there are no results. If an interrupted run left partial results, `warn` is
+    called with a sentence about them. Raises ChangedError for results of another capture or other
+    options, InputError, or OutputError if `target` is also the capture's folder, where the user's
+    own files may have the names of results.
     """
     try:
         report = read_report(target)
@@ -268,7 +268,7 @@ def find_earlier(
                 path=target,
                 hint="Add --overwrite, or choose another place with -o",
             ) from None
-        warn(f"{target}: {error}, so it is computed again")
+        warn(f"{target}: {error}, so the capture is computed again")
         return None
     except (*UNUSABLE, OverflowError, SplinecliError):
         made = "by another version"
@@ -285,8 +285,8 @@ def find_earlier(
     raise ChangedError(
         f"contains results made {made}",
         path=target,
-        hint="Add --update to redo what changed, --overwrite to redo everything, or choose another"
-        " place with -o",
+        hint="Add --update to redo changed captures, --overwrite to redo everything, or choose"
+        " another place with -o",
     )
 
 
@@ -307,8 +307,8 @@ def infer_batch(
     Args:
         folders: the captures. Duplicates are ignored.
         redo: which captures with existing results are computed again.
-        cluster: the processes or machines to run on. 0 workers are as many as the machine's cores
-            and memory allow.
+        cluster: the processes or machines to run on. If `workers` is 0, there are as many as the
+            machine's cores and memory allow.
 
     Raises:
         UsageError: see list_captures, or the options do not fit the method.

@@ -1,6 +1,4 @@
-"""Calibrate lights: read images of balls and of a gray target, and write light files and a
-report.
-"""
+"""Calibrate lights from images of balls and a gray target, and write light files and a report."""
 
 import json
 from typing import Any
@@ -79,14 +77,12 @@ def calibrate_lights(options: CalibrateOptions, observer: Observer = SILENT) -> 
         if crosstalk is not None:
             texts[CROSSTALK] = rows_text(crosstalk.reshape(-1, 3))
             place = options.output / CROSSTALK
-            said.append(f"The crosstalk was written to {place}, for infer --lights-in-channels")
+            said.append(f"The crosstalk was written to {place} for infer --lights-in-channels")
         if lamps is not None and lamps.known:
             texts[POSITIONS] = rows_text(lamps.positions)
             texts[PIXEL_SIZE] = f"{lamps.pixel_size:.9g}\n"
             place = options.output / POSITIONS
-            said.append(
-                f"The positions of the lamps were written to {place}, for --light-positions"
-            )
+            said.append(f"The lamp positions were written to {place} for infer --light-positions")
             if lamps.view.known:
                 texts[CAMERA_MATRIX] = rows_text(lamps.view.matrix)
         # Earlier files that are not overwritten are removed, because they belong to other lights.

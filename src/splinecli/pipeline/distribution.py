@@ -109,7 +109,7 @@ def _local_cluster(options: ClusterOptions) -> Iterator[Any]:
     loggers = ("distributed", *(f"distributed.{part}" for part in parts), "tornado")
     settings: dict[str, Any] = {
         "distributed.nanny.pre-spawn-environ": environment,
-        # Collect no data for a dashboard, because they cost processor time and memory.
+        # Do not collect data for a dashboard, which takes processor time and memory.
         "distributed.admin.low-level-log-length": 100,
         "distributed.admin.system-monitor.log-length": 10,
         "distributed.admin.system-monitor.interval": "10s",
@@ -297,7 +297,7 @@ class Distributor:
             # A cluster on this machine is considered lost after a minute.
             elif not self.options.address and time.monotonic() - began > 60.0:
                 raise SplinecliError(
-                    "the workers stop while they are starting",
+                    "the workers stop before they are ready",
                     hint="If memory is short, use fewer workers. Dask's output has the details",
                 )
             while following is not None and len(self.running) < len(workers):

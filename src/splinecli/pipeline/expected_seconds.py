@@ -1,8 +1,7 @@
-"""The expected seconds of each stage of `infer` for a capture: for its progress bar, and for
-`info`.
+"""Predict the seconds of each stage of `infer`, for its progress bar and for `info`.
 
 The costs were measured on two cores, with native bfloat16 and with AVX2 alone
-(benchmarks/large_captures.py). Other processors may differ from them by a factor of two.
+(benchmarks/large_captures.py). On other processors, they may differ by a factor of two.
 """
 
 from collections.abc import Collection
@@ -37,9 +36,9 @@ class _Costs(NamedTuple):
 _BFLOAT16 = _Costs(1.7e-7, 1.2e-4, 1.1e-6, 3.0e-5, 1.4e-6, 0.9e-3, 2e-7)
 _FLOAT32 = _Costs(1.9e-7, 2.5e-4, 1.8e-6, 7.0e-5, 1.7e-6, 1.2e-3, 2e-7)  # AVX2
 _OTHER_METHODS = 4e-5  # per pixel
-_UNLIKE = 0.005  # share of pixels that the network estimates beside a distilled estimator
+_UNLIKE = 0.005  # share of the pixels that the network estimates despite distillation
 _INDIRECT = 0.3  # share of the pixels that are usually estimated again
-_ALIGN, _ALIGN_ROOT = 1.0, 7e-3  # plus this times the square root of the values of all images
+_ALIGN, _ALIGN_ROOT = 1.0, 7e-3  # seconds, and seconds per square root of the number of values
 
 
 def expected_seconds(
@@ -57,11 +56,11 @@ def expected_seconds(
     Args:
         n_pixels: number of pixels of the mask.
         image_pixels: number of pixels of all images together.
-        read_pixels: the same, counting an image each time that it is read; None for once.
-        network: whether the method is spline-net, and not a fit.
+        read_pixels: the same, counting an image each time it is read; None if each is read once.
+        network: whether the method is spline-net rather than a fit.
         distils: whether a distilled estimator is used. None decides by AUTOMATIC_FROM.
         align: whether the images are aligned.
-        maps: the maps that are also written.
+        maps: further maps that are written.
     """
     cores = min(count_available_cores(), 8)
     costs = _BFLOAT16 if _has_bfloat16() else _FLOAT32
@@ -95,8 +94,8 @@ def expected_seconds(
 
 
 def _has_bfloat16() -> bool:
-    """Return whether the processor has bfloat16; without PyTorch, whose import takes longer than
-    all of `info`.
+    """Return whether the processor supports bfloat16, without importing PyTorch, which takes longer
+    than all of `info`.
     """
     try:
         text = Path("/proc/cpuinfo").read_text("utf-8")

@@ -1,4 +1,4 @@
-"""Options for reading a capture from the file splinecli.toml in its folder."""
+"""Read and write splinecli.toml, the file in a capture's folder with options for reading it."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def with_settings(options: Options, folder: Path, kind: type[records.Record]) ->
         if name in options.__struct_fields__ and not options.has(name)
     }
     of_folder = kind(**settings)
-    for first, second, _ in options.CONFLICTS:  # the options given take precedence
+    for first, second, _ in options.CONFLICTS:  # options on the command line take precedence
         for one, other in ((first, second), (second, first)):
             name = other.partition("=")[0]
             if name in settings and options.has(one) and of_folder.has(other):

@@ -91,8 +91,7 @@ _SHEET_CAPTION = (
 )
 _LOWERING = (LIGHTS_UNCERTAIN, UNDECIDED)  # notes that explain a low confidence
 _LIGHTS_CAPTION = (
-    "The lights that were found, around the camera axis; circles have the radius of their expected"
-    " errors"
+    "The estimated lights around the camera axis; the radius of each circle is the expected error"
 )
 
 # If all lights are tilted, the network's normals are tilted by less, so the tilt is undone in
@@ -137,7 +136,7 @@ def source_bytes(open_source: Callable[[], CaptureSource], n_lights: int = 0) ->
 def distil_for(
     capture: Capture, estimator: Estimator, wanted: bool | None, clock: Clock | None = None
 ) -> tuple[DistilledEstimator | None, list[CaptureWarning]]:
-    """Return a distilled estimator for a capture, or None to use `estimator` on every pixel; and
+    """Return a distilled estimator for a capture, or None to use `estimator` on every pixel, and
     warnings.
 
     Under near lamps, the capture must contain its surface points. If `wanted` is None,
@@ -189,13 +188,12 @@ def estimate_capture(
     clock: Clock | None = None,
 ) -> tuple[NormalEstimate, DistilledEstimator | None, Work]:
     """Return the normals of a prepared capture, the distilled estimator if one was used, and the
-    work.
+    work with its clear faults corrected.
 
-    The capture, with all warnings added to it, is part of the estimate; the work is returned after
-    its clear faults were mended. The capture is judged before `load` is called, which returns the
-    estimator. `distil` is as in distil_for. `progress` is called with the number of pixels just
-    estimated. If the options of the recipe are strict, a warning that an input is probably wrong
-    becomes an InputError. The clock times the stages and shows them.
+    The estimate contains the capture with all warnings. The capture is checked before `load` is
+    called, which returns the estimator. `distil` is as in distil_for. `progress` is called with the
+    number of pixels just estimated. If the options of the recipe are strict, a warning that an
+    input is probably wrong becomes an InputError. The clock times the stages and shows them.
     """
     clock = clock or Clock()
     clock.begin("check", note="checking")

@@ -761,17 +761,17 @@ class InfoOptions(Display, frozen=True, kw_only=True):
     auto_mask: bool = flag("Input", "If there is no mask, find the object in the images.")
     check_lights: bool = flag(
         "Lights",
-        "List other readings of the light file, and how well each of them fits the images.",
+        "List other readings of the light file, and how well each one fits the images.",
     )
     mended_lights: Path | None = option(
         "Lights",
-        "If the light directions fit the images better in another order or frame, write them in"
-        " it.",
+        "If the light directions fit the images better in another order or frame, write the"
+        " corrected ones.",
         "FILE",
     )
     plot: Path | None = option("Output", "Also plot the light directions to a PNG file.", "FILE")
     write_settings: bool = flag(
-        "Output", "Write the options given here about reading to splinecli.toml in CAPTURE."
+        "Output", "Save the given options for reading the capture in CAPTURE/splinecli.toml."
     )
     output: FileName | None = option(
         "Output",

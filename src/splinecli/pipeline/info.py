@@ -55,7 +55,7 @@ def describe_capture(
         auto_mask = options.auto_mask or bool(
             reading.mask is None and read_settings(folder, FolderSettings).get("auto_mask")
         )
-        if settings is None:  # otherwise, those to be written replace them
+        if settings is None:  # otherwise, the settings to be written replace them
             reading = reading.with_settings(folder)
         source = reading.open(folder)
         _check_options(options, source)
@@ -153,7 +153,7 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
         ("weights", f"spline-net, SHA-256 {report['weights']['spline-net'][:16]}..."),
     ]
     if report["light_directions"]:
-        text = "what only the normals of the network show; infer checks it, and may correct a tilt"
+        text = "faults that only the network's normals reveal; infer also checks for these"
         rows.append(("not checked", text))
     if "mended_lights" in report:
         nothing = "not written, because no other reading of the lights fits clearly better"
@@ -175,7 +175,7 @@ def _camera_in_words(report: dict[str, Any]) -> str | None:
 
 
 def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
-    """Return a table of interpretations of the light file; empty unless it was requested."""
+    """Return a table of the readings of the light file; empty unless it was requested."""
     if not candidates:
         return []
     width = max(30, *(len(row["reading"]) + 2 for row in candidates))
@@ -192,9 +192,8 @@ def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
         lines.append(f"{row['reading']:{width}}{misfit:>8}{curl:>8}{rim:>9}{advantage:>11}")
     return [
         *lines,
-        "misfit: residual of the images, relative to lights in random order; it judges orders",
-        "advantage: evidence from curl and outline against the file as given; from 1 on, a warning"
-        " is given",
+        "misfit: residual of the images, relative to lights in random order, to compare orders",
+        "advantage: evidence from curl and outline over the file as given; from 1 on, infer warns",
     ]
 
 

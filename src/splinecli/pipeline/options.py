@@ -183,18 +183,18 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
         "Width of a pixel of the photographs on the object in millimetres, for a surface in"
         " millimetres.",
         "MM",
-        "as given to infer --surface by report.json beside the normal map, or none",
+        "from report.json of infer --surface beside the normal map, or none",
     )
     pixel_aspect: Annotated[float, Meta(ge=0.01, le=100)] = option(
         "Input",
-        "Height of a pixel on the object, in widths of a pixel, for line scanners and scaled"
+        "Height of a pixel on the object relative to its width, for line scanners and scaled"
         " images.",
         "A",
         value=1.0,
     )
     convention: Convention | None = option(
         "Input",
-        "Green channel of a normal map of colours: opengl is y up, directx is y down.",
+        "Green channel of a normal map stored as colours: opengl is y up, directx is y down.",
         "NAME",
         "as in report.json beside it, or opengl",
     )
@@ -206,8 +206,8 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
     )
     prior: Path | None = option(
         "Input",
-        "Depth map of the same view from elsewhere, such as a scan: the surface takes its overall"
-        " shape from it, and the detail from the normals. .npy, .tif or .exr, with heights"
+        "Depth map of the same view from another source, such as a scan, for the overall shape of"
+        " the surface; the detail comes from the normals. .npy, .tif or .exr, with heights"
         " towards the camera in the unit of the result, or with depths in millimetres for a"
         " perspective camera. NaN is unknown.",
         "FILE",
@@ -258,8 +258,8 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
     )
     solid: Annotated[float, Meta(gt=0, le=1e4)] | None = option(
         "Output",
-        "Close the mesh for printing: walls along its border, and a flat back so far behind its"
-        " lowest point.",
+        "Close the mesh for printing, with walls along its border and a flat back at this distance"
+        " behind its lowest point.",
         "MM",
         "open",
     )
@@ -381,8 +381,8 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
     weights: shared.Weights = None
     rotations: Count | None = option(
         "Method",
-        "Average the network's result over R views of each pixel: its lights rotated, for"
-        " spline-net also mirrored.",
+        "Average the network's results over R rotations of the lights of each pixel, for spline-net"
+        " also mirrored.",
         "R",
         "1; cnn-ps: 10",
     )
@@ -409,7 +409,7 @@ class EvaluateOptions(Display, frozen=True, kw_only=True):
     output: FileName = option(
         "Output", "Folder of the results.", "OUT", value="evaluation", names=OUTPUT
     )
-    overwrite: bool = flag("Output", "Compute all trials again, also those stored in OUT.")
+    overwrite: bool = flag("Output", "Compute all trials again, including those stored in OUT.")
 
     CONFLICTS = (
         ("draws", "n_lights", "Leave --n-lights out: the draws determine the number of lights"),

@@ -123,7 +123,7 @@ class _RecordMeta(StructMeta):
 
 
 class Record(Struct, metaclass=_RecordMeta, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A frozen record of options, whose fields are validated.
+    """A frozen record of options with validated fields.
 
     Raises UsageError for an invalid value, or if two options cannot be used together.
     """
@@ -131,7 +131,7 @@ class Record(Struct, metaclass=_RecordMeta, frozen=True, kw_only=True, forbid_un
     CONFLICTS: ClassVar[Conflicts] = ()
     """Pairs of fields of which only one may differ from its default, each with a hint.
 
-    In place of a field, NAME=VALUE stands for one with this value.
+    Instead of a field's name, NAME=VALUE stands for the field with this value.
     """
 
     def __post_init__(self) -> None:
@@ -180,7 +180,7 @@ class Record(Struct, metaclass=_RecordMeta, frozen=True, kw_only=True, forbid_un
 
     @classmethod
     def from_arguments(cls, given: dict[str, Any]) -> Self:
-        """Remove the record's command-line values from `given`, and return the record.
+        """Return the record of its command-line values, which are removed from `given`.
 
         Raises UsageError.
         """
@@ -315,10 +315,12 @@ def kind_in_words(kind: Any) -> str:
         names = list(map(repr, get_args(bare)))
         return " or ".join(names) if len(names) < 3 else f"one of {', '.join(names)}"
     if get_origin(bare) in (list, dict):
-        whole = "list" if get_origin(bare) is list else "table"
-        return f"a {whole}, each {kind_in_words(Annotated[get_args(bare)[-1], limits(kind)])}"
+        whole = (
+            "list in which each item" if get_origin(bare) is list else "table in which each value"
+        )
+        return f"a {whole} is {kind_in_words(Annotated[get_args(bare)[-1], limits(kind)])}"
     if bare not in (int, float):
-        return {bool: "true or false", str: "a text", Path: "a text"}.get(
+        return {bool: "true or false", str: "a string", Path: "a string"}.get(
             bare, "a table of settings"
         )
     words, given = "a whole number" if bare is int else "a number", limits(kind)

@@ -1,8 +1,8 @@
-"""The warnings of a capture: one row of the table for each kind, with a stable code for programs.
+"""The kinds of warnings about a capture, one per row, each with a stable code for programs.
 
-A check or a reader creates a warning from its row, with a human-readable sentence. The rows also
-generate the table in docs/warnings.md (docs/make_tables.py), and determine the warnings that
-`--strict` turns into errors.
+Checks and readers create warnings from these rows, each with a human-readable sentence. The table
+in docs/warnings.md is generated from the rows (docs/make_tables.py), which also determine the
+warnings that `--strict` turns into errors.
 """
 
 from dataclasses import dataclass
@@ -14,12 +14,11 @@ from splinecli.maths import Float64Array
 
 @dataclass(frozen=True)
 class WarningKind:
-    """A row of the table.
+    """A kind of warning.
 
-    code: a name that stays the same when the sentences change.
-    meaning, remedy: for the documentation, in Markdown.
-    severity: "error" means that an input is probably wrong; with --strict, the warning becomes an
-    error.
+    code: a name that stays the same even if the messages are reworded. meaning, remedy: for the
+    documentation, in Markdown. severity: "error" means that an input is probably wrong; with
+    --strict, the warning becomes an error.
     """
 
     code: str
@@ -39,8 +38,8 @@ class CaptureWarning:
     error_deg: the median angular error of the normals in degrees if the warning is correct. The
         confidence is lowered accordingly. None if the normals are not affected, or the confidence
         accounts for the fault in another way.
-    again: the part of the text that differs between captures, for the second one in a batch and
-        later ones. Empty if the whole text is repeated.
+    again: a shorter text for later captures of a batch, with the facts that differ between
+        captures. Empty if the whole text is repeated.
     """
 
     kind: WarningKind
@@ -62,7 +61,7 @@ class CaptureWarning:
 
 fault = partial(WarningKind, severity="error")
 
-# The rows form a table: code, meaning, remedy. A fault means that an input is probably wrong.
+# Each row has a code, a meaning and a remedy. A fault means that an input is probably wrong.
 AMBIENT_SUBTRACTED = WarningKind(
     "ambient_subtracted", "The image `ambient.*` in the folder was subtracted"
 )
@@ -73,19 +72,19 @@ BLACK_PIXELS = WarningKind(
 )
 CONSTANT_LIGHT = fault(
     "constant_light",
-    "The images look as if they contained [ambient"
+    "The images seem to contain [ambient"
     " light](input-checks.md#other-interpretations-of-the-images) or a black level",
     "`--ambient IMAGE`, taken with all lamps off",
 )
 CURVE_MENDED = WarningKind(
     "curve_mended",
-    "The images were clearly [encoded](input-checks.md#other-interpretations-of-the-images) without"
-    " stating it, and were decoded",
+    "The images were clearly [encoded](input-checks.md#other-interpretations-of-the-images),"
+    " although their files do not specify a curve, so they were decoded",
     "`--transfer linear` if they are linear",
 )
 DARK_IMAGES = WarningKind(
     "dark_images",
-    "The images use less than 5 % of the range, or 25 % with 8 bits",
+    "Some images use less than 5 % of the range, or less than 25 % with 8 bits",
     "Use a longer exposure",
 )
 DISPLAY_DECODED = WarningKind(
@@ -100,38 +99,38 @@ DISPLAY_ENCODED = WarningKind(
 )
 EIGHT_BIT = WarningKind(
     "eight_bit",
-    "The images have 8 bits; the text states what [this costs](robustness.md#8-bits)",
-    "Export 16-bit linear images, or use RAW; round, do not cut",
+    "The images have 8 bits; the message states the [loss of accuracy](robustness.md#8-bits)",
+    "Export 16-bit linear images, or use RAW; round to 8 bits instead of truncating",
 )
 ELEVATION_SUSPECTED = fault(
     "elevation_suspected",
-    "The images fit the lights much better if all of them are higher or lower",
+    "The images would fit the lights much better if all of them were higher or lower",
     "Correct the elevations in the light file, or use `info --mended-lights`",
 )
 ESTIMATED_COLOURS = WarningKind(
     "estimated_colours",
     "The lamps have different colours, which were estimated and divided out",
-    "RGB intensities with `--intensities FILE` if you measured them",
+    "RGB intensities with `--intensities FILE` if you have measured them",
 )
 ESTIMATED_INTENSITIES = WarningKind(
     "estimated_intensities",
     "Light intensities were [estimated](image-preparation.md#estimated-light-intensities)",
-    "`--intensities FILE` if you measured them",
+    "`--intensities FILE` if you have measured them",
 )
 ESTIMATED_LIGHTS = WarningKind(
     "estimated_lights",
-    "The light directions were [found from the images](unknown-lights.md)",
+    "The light directions were [estimated from the images](unknown-lights.md)",
     "Measure the lights if the expected error is too large",
 )
 EXIF_EXPOSURE = WarningKind(
     "exif_exposure",
-    "EXIF states different exposures, by which the images were divided",
+    "The exposures in EXIF differ, so the images were divided by them",
     "Expose all images alike, with exposure and white balance fixed",
 )
 EXIF_ORIENTATION = WarningKind(
     "exif_orientation",
     "An EXIF tag rotates the images in viewers; splinecli uses the stored pixels",
-    "Make mask and lights for the stored pixels",
+    "Make the mask and the lights fit the stored pixels",
 )
 FEW_LIGHTS = WarningKind("few_lights", "There are fewer than eight lights", "Add lights")
 FLAT_FIELD_CHOICE = WarningKind(
@@ -146,7 +145,7 @@ GRAY_MATERIAL = WarningKind(
 GROUND_TRUTH_FRAME = fault(
     "ground_truth_frame",
     "The ground truth fits the images only if x or y is negated, or x and y are exchanged",
-    "Convert it to x right, y up, z to the camera; if the lights are wrong, `--light-frame`",
+    "Convert it to x right, y up, z to the camera; if the lights are wrong, use `--light-frame`",
 )
 GROUND_TRUTH_SHIFTED = fault(
     "ground_truth_shifted",
@@ -166,7 +165,7 @@ IMAGE_INCONSISTENT = fault(
 )
 IMAGE_SCALE = fault(
     "image_scale",
-    "One image is 16, 64 or 256 times darker or brighter than the others predict, as with a"
+    "One image is 16, 64 or 256 times darker or brighter than the others predict, like a"
     " 12-bit image among 16-bit ones",
     "Save all images with the same bit depth",
 )
@@ -176,25 +175,25 @@ IMAGES_ALIGNED = WarningKind(
 )
 IMAGES_LEFT_OUT = WarningKind(
     "images_left_out",
-    "The light file does not list all images, or some pictures have the name of a mask or map, or"
-    " another size",
+    "The light file does not list all images, or some pictures are named like a mask or a map, or"
+    " have another size",
     "Check names and sizes",
 )
 IMAGES_SHIFTED = fault(
     "images_shifted",
-    "Images are [shifted against the others](input-checks.md#shifted-images)",
+    "Images are [shifted relative to the others](input-checks.md#shifted-images)",
     "[`--align`](image-preparation.md#moved-images); next time, photograph from a tripod",
 )
 LAMP_DISTANCE = fault(
     "lamp_distance",
     "A lamp is nearer than the object is wide, or hundreds of widths away",
-    "Use one unit for lamps and pixel size",
+    "Use the same unit for the lamps and the pixel size",
 )
 LIGHT_COLOURS = fault(
     "light_colours",
     "The lamps have different colours, and some lack a channel, so the colours cannot be divided"
     " out",
-    "White lamps, or RGB intensities",
+    "Use white lamps, or measure RGB intensities",
 )
 LIGHT_FRAME = fault(
     "light_frame",
@@ -209,8 +208,8 @@ LIGHT_ORDER = fault(
 )
 LIGHTS_CONTRADICTED = fault(
     "lights_contradicted",
-    "The images clearly fit [other lights](input-checks.md#wrong-light-directions) than the given"
-    " ones",
+    "The images clearly fit [other lights](input-checks.md#wrong-light-directions) better than the"
+    " given ones",
     "Check their frame, order and elevations, or use `info --mended-lights`",
 )
 LIGHTS_FOUND = WarningKind(
@@ -228,7 +227,7 @@ LIGHTS_IN_CHANNELS = WarningKind(
     "lights_in_channels",
     "The channels are read as images under three lamps, as `--lights-in-channels` requests;"
     " coloured objects get wrong normals",
-    "A [crosstalk matrix](coloured-lights.md), and gray objects",
+    "Use a [crosstalk matrix](coloured-lights.md), and gray objects",
 )
 LIGHTS_MATCHED = WarningKind(
     "lights_matched",
@@ -275,7 +274,7 @@ MASK_CHOICE = WarningKind(
 MASK_INVERTED = fault(
     "mask_inverted",
     "The mask excludes a bright area in the middle",
-    "Invert it: white on the object",
+    "Invert it, so that the object is white",
 )
 NEAR_LAMPS = WarningKind(
     "near_lamps",
@@ -307,7 +306,7 @@ NOT_DISTILLED = WarningKind(
 )
 PROFILE_UNREAD = WarningKind(
     "profile_unread",
-    "The curve of a colour profile cannot be read",
+    "The transfer curve in a colour profile cannot be read",
     "`--transfer linear`, `srgb` or `gamma:G`",
 )
 REFINED_LIGHTS = WarningKind(
@@ -334,7 +333,7 @@ ROUGHNESS_UNDETERMINED = WarningKind(
 )
 SETTINGS_READ = WarningKind(
     "settings_read",
-    "The file `splinecli.toml` in the folder states how the capture is read",
+    "The file `splinecli.toml` in the folder sets options for reading the capture",
     "Options on the command line take precedence",
 )
 SATURATED = WarningKind(
@@ -353,8 +352,8 @@ UNDECIDED = WarningKind(
 )
 UNEQUAL_INTENSITIES = fault(
     "unequal_intensities",
-    "Light intensities look unequal, but the images do not determine them; or given intensities"
-    " do not fit the images",
+    "The light intensities seem unequal, but the images do not determine them; or given"
+    " intensities do not fit the images",
     "[Measure them](capture-and-calibrate.md#light-intensities), or correct the file",
 )
 UNKNOWN_MATERIAL = WarningKind(
@@ -369,51 +368,53 @@ UNTRAINED_LIGHTS = WarningKind(
 )
 WHITE_LEVEL = WarningKind(
     "white_level",
-    "The images look clipped below full scale, or no value of 16-bit files is above 10 or 12 bits",
+    "The images look clipped below full scale, or all values of 16-bit files fit in 10 or 12 bits",
     "`--white-level N` sets another value",
 )
 
 WARNINGS = {kind.code: kind for kind in list(globals().values()) if isinstance(kind, WarningKind)}
-# faults of the light directions that are mended if they are clear
+# faults of the light directions, which are corrected if they are clear
 FAULTS_OF_LIGHTS = frozenset(
     {ELEVATION_SUSPECTED, LIGHT_FRAME, LIGHT_ORDER, LIGHTS_CONTRADICTED, LIGHTS_TILTED}
 )
 PROBABLY_WRONG = frozenset(code for code, kind in WARNINGS.items() if kind.is_error)
-# median error of normals behind a blur of 2 to 4 pixels
+# median error of the normals, in degrees, from a blur of 2 to 4 pixels
 SOFT_DEG = 4.0
-# share of saturated observations above which the capture, or an image, carries a warning
+# share of saturated observations above which a warning is given
 SATURATED_SHARE = 0.01
 
 
 def mask_inverted(name: str) -> CaptureWarning:
-    """Warn that a mask is probably black on the object."""
+    """Return the warning that a mask is probably black on the object."""
     text = (
         f"{name} excludes a bright area in the middle and keeps its surroundings, so it is"
         " probably inverted."
     )
-    return CaptureWarning(MASK_INVERTED, f"{text} A mask is white on the object.")
+    return CaptureWarning(MASK_INVERTED, f"{text} Invert it, so that the object is white.")
 
 
 def soft_images() -> CaptureWarning:
-    """Warn that the images are too blurred to be sharpened."""
+    """Return the warning that the images are too blurred to be sharpened."""
     text = (
         "The images are blurred: no edge of a shadow, and no part of the outline, is sharper than"
-        " about 2 pixels. Sharpening cannot undo this: photograph the object again, in focus and"
+        " about 2 pixels. Sharpening cannot undo this, so photograph the object again, in focus and"
         " with a smaller aperture."
     )
     return CaptureWarning(SOFT_IMAGES, text, SOFT_DEG)
 
 
 def lights_mended(cause: str, *, in_files: bool = True) -> CaptureWarning:
-    """Report that the light directions were corrected, for a cause in a sentence."""
+    """Return the note that the light directions were corrected. `cause` is a sentence."""
     option = "--light-frame x-right,y-up" if in_files else "as_stored=True"
     text = f"{cause} They were corrected; {option} keeps them as given."
     return CaptureWarning(LIGHTS_MENDED, text)
 
 
 def estimated_lights(errors_deg: Float64Array, *, requested: bool) -> CaptureWarning:
-    """Report that the light directions were estimated, with expected errors (F,) in degrees,
-    because this was requested or because there is no light file.
+    """Return the note that the light directions were estimated, with expected errors (F,) in
+    degrees.
+
+    They are estimated because this was requested, or because there is no light file.
     """
     why, way_out = "", ""
     if not requested:

@@ -50,7 +50,8 @@ def test_round_trip_through_json(name):
         ({"held_share": 1.1}, "'held_share' is 1.1; expected a number from 0 to 1"),
         (
             {"sources": {"set": True}},
-            "'sources' is {'set': True}; expected a table, each a number of at least 0",
+            "'sources' is {'set': True}; expected a table in which each value is a number of at"
+            " least 0",
         ),
     ],
 )
