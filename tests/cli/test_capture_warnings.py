@@ -47,8 +47,8 @@ def test_shifted_images_are_named(run, medallion):
     move(medallion / "04.png", 2, -1)
     move(medallion / "09.png", 0, 4)
     words = (
-        "2 of 10 images are shifted against the others, in pixels: 04.png 2 right 1 up, 09.png 4"
-        " down."
+        "2 of 10 images are shifted relative to the others, in pixels: 04.png 2 right 1 up, 09.png"
+        " 4 down."
     )
     run(f"infer {medallion} --method ls", says=(words, "The images were aligned to"))
     aligned = read_report("medallion")

@@ -195,7 +195,7 @@ def test_films_that_cannot_be_used(run):
     film = write_film(Path("clip.avi"), sphere_film(np.repeat(path_of_lamp(1), 10, axis=0)))
     film.with_name("...mp4").write_bytes(film.read_bytes())
     for code, arguments, words in (
-        (2, f"{film} --light-frame x-left", "Leave out options about given lights"),
+        (2, f"{film} --light-frame x-left", "Leave out options that refer to given lights"),
         (
             3,
             f"{film} --lights estimate",

@@ -20,7 +20,7 @@ EXAMPLES = {
     " carried around the object.",
     "splinecli infer captures/* -o results --overwrite": "Process a folder of captures.",
     "splinecli infer catPNG --n-lights 10 --seed 0 --json": "Use ten lights and print the report.",
-    "splinecli watch parts/ -- --lights l.txt --jsonl": "Compute each part that arrives.",
+    "splinecli watch parts/ -- --lights l.txt --jsonl": "Process each part as it arrives.",
     "splinecli info obj/": "Describe the capture as infer would read it.",
     "splinecli info obj/ --transfer srgb"
     " --plot lights.png": "Check sRGB images, and plot the light directions.",
@@ -28,7 +28,7 @@ EXAMPLES = {
     "splinecli calibrate chrome/ --circle 512,384,200"
     " --gray-ball gray/ -o lights": "Give the outline of the ball, and"
     " also measure light intensities.",
-    "splinecli integrate results/cat": "Make depth and a mesh from the results of infer.",
+    "splinecli integrate results/cat": "Make a depth map and a mesh from the results of infer.",
     "splinecli integrate normals.png --mask mask.png"
     " --format obj -o surface": "Make a mesh from any normal map.",
     "splinecli evaluate pmsData --method ls --method spline-net"

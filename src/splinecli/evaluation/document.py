@@ -1,4 +1,4 @@
-"""The files that an evaluation writes: results, tables, plots, and an HTML report.
+"""Write the files of an evaluation: results, tables, plots and an HTML report.
 
 All functions take one evaluation, or several with the same methods that differ in n_lights,
 light_noise_deg or both.

@@ -1,5 +1,5 @@
-"""Figures of evaluations: the error against a setting, maps and observation maps of single
-captures, and relighting.
+"""Draw the figures of evaluations (the error against a setting, maps and observation maps of single
+captures), and score relighting.
 
 Curves include only the captures that all evaluations scored, so that all points of an average refer
 to the same captures. Relighting compares photographs under lights that are not in a draw with

@@ -139,7 +139,8 @@ def plan_capture(
     tasks: Sequence[ProtocolTrials],
     store: TrialStore,
 ) -> CaptureJob | None:
-    """Add the trials of a capture to the tasks, and return a job with the trials not in the store.
+    """Return a job with the trials of a capture that are not in the store, and add all its trials
+    to the tasks.
 
     If no protocol can score the capture, return None and record the reasons in the tasks.
     """
@@ -218,7 +219,7 @@ def draws_for(
     fewest = max(MIN_LIGHTS, protocol.n_lights or 0)
     if skipped and left < fewest:
         found = (
-            f"{name}: {max(left, 0)} of {source.n_lights} images remain without the first {skipped}"
+            f"{name}: {max(left, 0)} of {source.n_lights} images remain after the first {skipped}"
         )
         raise UsageError(f"{found}, expected at least {fewest}")
     if draws_file is not None:

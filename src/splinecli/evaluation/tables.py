@@ -1,4 +1,4 @@
-"""Significance tests for differences between methods, and tables for people.
+"""Test differences between methods for significance, and format tables.
 
 All methods are given the same draws of lights, and a draw that is hard for one method is usually
 hard for the others. Therefore, the test uses the differences trial by trial: a paired t-test
@@ -6,8 +6,8 @@ hard for the others. Therefore, the test uses the differences trial by trial: a 
 Scandinavian Journal of Statistics 1979). It covers only the variation between draws. A significant
 difference generalises to other lights on the same capture, but not to other captures.
 
-The tables are in Markdown, LaTeX, and rows for a terminal. Their functions take one evaluation, or
-several with the same methods that differ in n_lights, light_noise_deg or both.
+Tables are formatted as Markdown, LaTeX, or rows for a terminal, from one evaluation or from several
+with the same methods that differ in n_lights, light_noise_deg or both.
 """
 
 import re
@@ -147,7 +147,7 @@ _MOST_WIDE = 6
 _LATEX = str.maketrans(
     {character: f"\\{character}" for character in "&%$#_{}"}
     | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-    # In TeX's default font encoding, the oldest one, these codes are other characters.
+    # In TeX's default font encoding (OT1), these codes stand for other characters.
     | {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}
 )
 

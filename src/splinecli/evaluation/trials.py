@@ -1,5 +1,5 @@
-"""Trials, a store that saves their scores as they are computed, and the data of a capture for its
-trials.
+"""The trials of an evaluation, a store that saves their scores as they are computed, and the
+capture data that they share.
 """
 
 import hashlib
@@ -97,7 +97,7 @@ class Score(Struct, frozen=True):
 
 
 class _Line(Score, frozen=True, kw_only=True):
-    """The part of a stored line that is read again. The rest describes the trial for people."""
+    """The part of a stored line that is read again. The rest describes the trial to readers."""
 
     key: str
 

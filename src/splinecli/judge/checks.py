@@ -64,7 +64,7 @@ def shifted_images(seen: Evidence) -> Iterator[Finding]:
     more = f" and {len(shifts) - _MOST_NAMED} more" if len(shifts) > _MOST_NAMED else ""
     cause = (
         f"{len(shifts)} of {len(names)} images {'is' if len(shifts) == 1 else 'are'} shifted"
-        f" against the others, in pixels: {named}{more}. The camera or the object moved."
+        f" relative to the others, in pixels: {named}{more}. The camera or the object moved."
     )
     text = f"{cause} {ALIGN_ADVICE}"
     warning = CaptureWarning(codes.IMAGES_SHIFTED, text, seen.shift_error_deg)

@@ -72,7 +72,7 @@ from splinecli.system.publishing import held_folder, is_plain
 class BatchItem:
     """A capture of a batch.
 
-    `missing` is the reason that it cannot be read if the folder does not exist.
+    If the folder does not exist, `missing` is the error that says so.
     """
 
     folder: Path
@@ -412,9 +412,9 @@ def _infer(
 
 @lru_cache(maxsize=1)
 def _method(options: InferOptions, method: MethodOptions, sha256: str | None) -> Estimator:
-    """Return this worker's estimator, which takes a second to load.
+    """Return this worker's estimator, which is kept because loading it takes a second.
 
-    Unlike `method`, options ignore the device.
+    Raises ModelError if its weights differ from those on the machine of the command.
     """
     estimator = make_method(options)
     found = None if estimator.weights is None else estimator.weights["sha256"]

@@ -44,8 +44,8 @@ def unpacked(
         return capture
     if not (reading.finds_lights or reading.may_find_lights):
         raise UsageError(
-            f"{capture} is a video, whose lights have to be estimated",
-            hint="Leave out options about given lights",
+            f"{capture} is a video, so its lights must be estimated",
+            hint="Leave out options that refer to given lights",
         )
     folder, stamp = output / FOLDER / capture.stem, digest([stamp_content(capture)])
     refuse_link(folder.parent)

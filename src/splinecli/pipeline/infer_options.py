@@ -423,7 +423,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
         """Open the capture in the folder with these options.
 
         If the capture has no lights, they remain to be estimated. Raises InputError, or UsageError
-        if a first light is given although the lights are given.
+        if --first-light is given although the capture has a light file.
         """
         try:
             source = self._open(folder, needs_lights=not self.finds_lights)
@@ -480,7 +480,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
 
 
 class FolderSettings(ReadingOptions, frozen=True, kw_only=True):
-    """The options that splinecli.toml in a capture's folder may contain: no outputs and methods."""
+    """The options that splinecli.toml may contain, without those for output and methods."""
 
     auto_mask: AutoMask = False
 

@@ -192,7 +192,7 @@ def _candidate_lines(candidates: list[dict[str, Any]] | None) -> list[str]:
         lines.append(f"{row['reading']:{width}}{misfit:>8}{curl:>8}{rim:>9}{advantage:>11}")
     return [
         *lines,
-        "misfit: residual of the images, relative to lights in random order, to compare orders",
+        "misfit: residual of the images relative to lights in random order, for comparing orders",
         "advantage: evidence from curl and outline over the file as given; from 1 on, infer warns",
     ]
 

@@ -268,10 +268,12 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.prior_detail is not None and self.prior is None:
-            raise UsageError("--prior-detail needs --prior")
+            hint = "Add --prior, or leave --prior-detail out"
+            raise UsageError("--prior-detail needs --prior", hint=hint)
         if self.decimate is not None and self.pixel_aspect != 1:
             raise UsageError(
-                "--decimate needs square pixels, so it cannot be used with --pixel-aspect"
+                "--decimate needs square pixels, so it cannot be used with --pixel-aspect",
+                hint=LEAVE_ONE,
             )
 
     @property

@@ -220,7 +220,7 @@ def divide_by_intensities(work: Work, _: Callable[[], object]) -> Work:
 
 
 def restore(work: Work, _: Callable[[], object]) -> Work:
-    """Replace saturated observations by estimates; see restore_saturated."""
+    """Replace saturated observations with estimates; see restore_saturated."""
     flags = work.saturated.flags
     if flags is None:
         return work
@@ -250,7 +250,7 @@ def mend(work: Work, _: Callable[[], object]) -> Work:
     files = source if isinstance(source, CaptureSource) else None
 
     def causes(*kinds: WarningKind) -> str:
-        """Return the causes of the faults of these kinds, and count the kinds as corrected."""
+        """Return the causes of the faults of these kinds, and record the kinds as corrected."""
         mended_kinds.update(kinds)
         return " ".join(each.cause for each in remedy.faults if each.warning.kind in kinds)
 

@@ -1,8 +1,8 @@
 """The files that splinecli writes, with one row of MAPS for each optional map.
 
 A row defines how its map is computed, written, read, drawn and shown, how much memory it needs, and
-that its pictures are not read as photographs. results/map_values.py registers the functions that
-compute and draw the maps.
+its file names, which are not read as photographs. results/map_values.py registers the functions
+that compute and draw the maps.
 """
 
 from collections.abc import Sequence
@@ -161,9 +161,9 @@ _ROWS = (
     ),
     OutputMap(
         name="curvature",
-        content="mean and Gaussian curvature from the normals, filtered with 2 pixels; float32, H"
-        " x W x 2, in 1/pixel and 1/pixel^2. Bumps are positive. The picture shows the mean"
-        " curvature: gray is 0, white 0.05 per pixel",
+        content="mean and Gaussian curvature of the normals, smoothed over 2 pixels; float32, H x W"
+        " x 2, in 1/pixel and 1/pixel^2. Bumps are positive. The picture shows the mean curvature:"
+        " gray is 0, white 0.05 per pixel",
         unit="mean and Gaussian curvature, 1/pixel and 1/pixel^2",
         scale=0.05,
         scale_text="mean curvature, black -{scale}, gray 0, white {scale} per pixel",

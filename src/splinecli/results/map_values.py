@@ -1,5 +1,5 @@
-"""Functions that compute the values of maps from the normals and the images of a capture,
-registered for the rows of MAPS.
+"""Compute the values of maps from the normals and the images of a capture. Each function is
+registered for a row of MAPS.
 """
 
 from __future__ import annotations

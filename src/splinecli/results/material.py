@@ -1,4 +1,4 @@
-"""The material of a capture as a map, and its pictures, with the conventions of glTF."""
+"""Compute the material map of a capture and its pictures, which follow the conventions of glTF."""
 
 from __future__ import annotations
 
