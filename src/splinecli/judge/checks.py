@@ -578,14 +578,14 @@ def repeated_images(observations: Floats) -> list[tuple[int, int]]:
 
 
 def check_confidence(expected_under_5: float | None) -> list[CaptureWarning]:
-    """Warn about a capture if the network expects hardly any normal to be accurate. The share is
-    None for methods that do not predict errors.
+    """Warn about a capture if the network predicts large errors for nearly all normals. The share
+    is None for methods that do not predict errors.
     """
     if expected_under_5 is None or expected_under_5 >= LEAST_EXPECTED:
         return []
     text = (
-        f"The network expects only {100 * expected_under_5:.0f} % of the normals to be within 5"
-        " degrees. The lights, the mask or the images are probably wrong; see"
+        f"The network predicts errors below 5 degrees for only {100 * expected_under_5:.0f} % of the"
+        " normals. The lights, the mask or the images are probably wrong; see"
         " docs/troubleshooting.md."
     )
     return [CaptureWarning(codes.LOW_CONFIDENCE, text)]

@@ -1,6 +1,6 @@
 """Detect given lights that contradict the images, with the network that estimates normals.
 
-Under wrong lights, the network expects larger errors, and its normals do not fit a surface (see
+Under wrong lights, the network predicts larger errors, and its normals do not fit a surface (see
 estimate/light_descent.py). A few steps of a descent show whether better lights are near, whether
 the given ones are tilted or have a wrong frame, order or elevation. If so, lights are estimated
 from the images alone (lights/unknown_lights.py) and compared with the given ones. If the values are
@@ -82,7 +82,7 @@ def ask_network(work: Work, judgement: Judgement) -> Judgement:
         )
     if fall > _UNCERTAIN and not any(each.is_error for each in judgement.warnings):
         text = (
-            f"Under lights that differ by {moved_deg:.0f} degrees on average, the network expects"
+            f"Under lights that differ by {moved_deg:.0f} degrees on average, the network predicts"
             " smaller errors and finds a better surface. The given lights may be inaccurate, or the"
             " material unusual, so the confidence is lowered."
         )

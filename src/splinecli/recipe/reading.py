@@ -215,8 +215,9 @@ def _dark_images(dark: Sequence[ImageSummary], observed: Observed) -> CaptureWar
         )
         return CaptureWarning(codes.WHITE_LEVEL, text)
     most = max(DARK[image.dtype] for image in dark)
+    use = "uses" if len(dark) == 1 else "use"
     text = (
-        f"{len(dark)} of {len(observed.images)} images use less than {100 * most:.0f} % of the"
+        f"{len(dark)} of {len(observed.images)} images {use} less than {100 * most:.0f} % of the"
         f" range, such as {dark[0].path.name}. A longer exposure gives less noise"
     )
     # A few dark images may have been stored with another bit depth.

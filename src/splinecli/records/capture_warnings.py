@@ -256,7 +256,7 @@ LIGHTS_TILTED = fault(
 )
 LIGHTS_UNCERTAIN = WarningKind(
     "lights_uncertain",
-    "The network expects smaller errors under [other"
+    "The network predicts smaller errors under [other"
     " lights](input-checks.md#wrong-light-directions), so the confidence is lowered",
     "Check the lights; none for unusual materials",
 )
