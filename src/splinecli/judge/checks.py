@@ -584,8 +584,8 @@ def check_confidence(expected_under_5: float | None) -> list[CaptureWarning]:
     if expected_under_5 is None or expected_under_5 >= LEAST_EXPECTED:
         return []
     text = (
-        f"The network predicts errors below 5 degrees for only {100 * expected_under_5:.0f} % of the"
-        " normals. The lights, the mask or the images are probably wrong; see"
+        f"The network predicts errors below 5 degrees for only {100 * expected_under_5:.0f} % of"
+        " the normals. The lights, the mask or the images are probably wrong; see"
         " docs/troubleshooting.md."
     )
     return [CaptureWarning(codes.LOW_CONFIDENCE, text)]
