@@ -409,7 +409,7 @@ def _order_words(check: LightCheck, light_file: Path) -> tuple[str, str]:
             f"The images fit {light_file.name} no better than lights in a random order (misfit"
             f" relative to random orders: {given:.0f} %)."
         )
-        advice = "Its lines are not in the order of the images, or it belongs to another capture."
+        advice = "Check that it belongs to this capture and lists the lights in the images' order."
         return cause, advice
     advice = "Check that its lines are in the order of the images."
     if check.order == ZENITH:
