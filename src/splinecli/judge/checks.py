@@ -34,8 +34,8 @@ LEAST_EXPECTED = 0.1  # smallest expected share of normals within 5 degrees with
 # because no reading reduces it as much with wrong lights or moved images.
 DECISIVE = 0.35
 _MOST_NAMED = 4  # shifted images in a sentence
-# Of readings that are named although none is probable: the least probability, and the least change
-# of the normals to be expected, chosen on rendered captures (benchmarks/judgement.py).
+# Readings that are named although none is likely: the least probability of each, and the least
+# expected change of the normals, chosen on rendered captures (benchmarks/judgement.py).
 _NAMED_SHARE, _UNDECIDED_DEG = 0.03, 2.0
 _TRANSLUCENT_DEG = 8.0  # the usual median error of normals of translucent objects
 
@@ -378,8 +378,8 @@ def _of_given_intensities(given: Float64Array, reading: Explanation, left: str) 
 
 
 def undecided_readings(seen: Evidence) -> list[CaptureWarning]:
-    """Warn about other readings, none of which is probable enough to be named as a fault, but which
-    together would change the normals.
+    """Return a warning about other readings that are not probable enough to be reported as faults,
+    but would together change the normals.
     """
     errors_deg: dict[str, float] = {}
     if seen.shares.get(TRANSLUCENT, 0.0) < LIKELY:  # otherwise it is named
@@ -402,9 +402,9 @@ def undecided_readings(seen: Evidence) -> list[CaptureWarning]:
     most_deg = max(errors_deg[kind] for kind in likeliest)
     text = (
         f"The images may also be explained by {named}, which would rotate the normals by up to"
-        f" {most_deg:.0f} degrees. The images do not decide this, so the confidence is lowered."
+        f" {most_deg:.0f} degrees. The images do not rule this out, so the confidence is lowered."
     )
-    # Half of it makes the expected shares of right normals agree with the true ones.
+    # With half of the error, the expected shares of accurate normals agree with the true ones.
     return [CaptureWarning(codes.UNDECIDED, text, error_deg / 2)]
 
 

@@ -101,7 +101,9 @@ class LightCheck:
                 " object)"
             )
         if self.in_ring:
-            missing.append("their elevation (as all have the same, a wrong one fits as well)")
+            missing.append(
+                "their elevation (it is the same for all lights, so a wrong one fits equally well)"
+            )
         if self.order == UNKNOWN_ORDER or self.best is not None:
             return missing
         if not np.isfinite(self.given.curl):

@@ -246,7 +246,8 @@ LIGHTS_NEAR_AXIS = WarningKind(
 LIGHTS_UNCHECKED = WarningKind(
     "lights_unchecked",
     "Shadows that the lights should cast are missing; with `--strict`, also if the order, the"
-    " frame or the elevation of the lights [cannot be checked](input-checks.md#wrong-light-directions)",
+    " frame or the elevation of the lights [cannot be"
+    " checked](input-checks.md#wrong-light-directions)",
     "Compare bumps and hollows with the object",
 )
 LIGHTS_TILTED = fault(
@@ -348,7 +349,7 @@ UNDECIDED = WarningKind(
     "reading_undecided",
     "Other explanations, such as near lamps, [remain possible](input-checks.md), so the confidence"
     " is lowered",
-    "Check how the capture was made; more lights, well spread, decide more",
+    "Check how the capture was made, or add lights from other sides",
 )
 UNEQUAL_INTENSITIES = fault(
     "unequal_intensities",
