@@ -110,7 +110,7 @@ def other_scale(seen: Evidence) -> Iterator[Finding]:
         text = (
             f"{name} is {how} than the other images predict, as if it had {16 - bits} bits and the"
             " others 16, or vice versa. Save all images with the same bit depth, or scale it by"
-            f" 2^{bits}."
+            f" 2^{bits if factor < 1 else -bits}."
         )
         error_deg = median_turn_deg(seen.observations, lights, lights, mended)
         seen = seen.scaled(scales)
