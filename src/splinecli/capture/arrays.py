@@ -1,4 +1,4 @@
-"""Images and lights in memory as a source, for `splinecli.estimate_normals`."""
+"""A source of images and lights that are already in memory, for `splinecli.estimate_normals`."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -91,16 +91,17 @@ def open_arrays(
         images: (F, H, W) gray or (F, H, W, 3) RGB, linear. uint8 and uint16 values are scaled by
             their full range; floating-point values are not scaled.
         light_directions: (F, 3) vectors towards the lights, of any length; x right, y up, z to the
-            camera. None if they have to be estimated.
-        mask: (H, W), True at the pixels of the object. In a mask of numbers, as in a mask file,
-            these are the values above half of the maximum. None uses all pixels.
+            camera. None to have them estimated.
+        mask: (H, W), True at the object's pixels. A numeric mask is thresholded at half of its
+            maximum, as mask files are. None uses all pixels.
         light_intensities: (F,) or (F, 3) RGB. None if they are unknown.
-        pixel_size: the width of a pixel on the object, for near lamps. In this case,
-            light_directions are positions in the same unit, relative to the centre of the image on
-            the object's mean plane. None for distant lights.
+        pixel_size: the width of a pixel on the object, for near lamps; light_directions are then
+            lamp positions in the same unit, relative to the centre of the image on the object's
+            mean plane. None for distant lights.
         camera_matrix: (3, 3) in pixels, as in OpenCV. None assumes an orthographic camera.
-        white_level: observations at or above this value are saturated, in the unit of the images.
-            None detects it in integer images, and assumes no saturation in floating-point images.
+        white_level: the value, in the unit of the images, from which observations are saturated. By
+            default, it is detected in integer images, and floating-point images are assumed not to
+            be saturated.
 
     Raises:
         UsageError: a shape or a type is invalid.
@@ -110,7 +111,7 @@ def open_arrays(
     shape, n_lights = stack[0].shape[:2], len(stack)
     if light_directions is None and pixel_size is not None:
         raise UsageError(
-            "near lamps need positions, but light_directions is None", hint="Leave pixel_size out"
+            "near lamps need positions, but light_directions is None", hint="Omit pixel_size"
         )
     directions = (
         placeholders(n_lights)
@@ -119,11 +120,11 @@ def open_arrays(
     )
     check_white_level(white_level)
     inside = np.ones(shape, np.bool_) if mask is None else np.array(mask)
-    if inside.dtype != np.bool_:  # the rule of mask files for numbers
+    if inside.dtype != np.bool_:  # the same rule as for mask files
         inside = inside > max(inside.max(initial=0) / 2, 0)
     if inside.shape != shape:
         raise UsageError(
-            f"found a mask of shape {inside.shape}, expected (H, W) = {shape}, like the images"
+            f"found a mask of shape {inside.shape}, expected (H, W) = {shape}, as the images have"
         )
     if not inside.any():
         raise InputError("capture: the mask is empty")
@@ -153,8 +154,8 @@ def _checked_images(images: ArrayLike | Sequence[Array]) -> list[Array]:
         first = stack[0].shape
         if image.shape != first:
             raise UsageError(
-                f"found an image of shape {image.shape} at images[{index}], expected {first}, like"
-                " images[0]"
+                f"found an image of shape {image.shape} at images[{index}], expected {first}, as"
+                " images[0] has"
             )
         if (
             image.ndim not in (2, 3)
@@ -170,7 +171,7 @@ def _checked_images(images: ArrayLike | Sequence[Array]) -> list[Array]:
                 f"found images of type {image.dtype}, expected uint8, uint16 or floating point"
             )
             raise UsageError(
-                problem, hint="Convert them with images.astype(...), without changing the scale"
+                problem, hint="Convert them with images.astype(...), without rescaling the values"
             )
     return stack
 
@@ -181,7 +182,7 @@ def _checked_directions(directions: ArrayLike, n_lights: int) -> Float64Array:
         expected = f"(F, 3) = {(n_lights, 3)}, one for each image"
         raise UsageError(f"found light directions of shape {vectors.shape}, expected {expected}")
     if not np.isfinite(vectors).all():
-        raise InputError("a light direction is not finite")
+        raise InputError("found a light direction that is not finite")
     rows = [f" in row {row}" for row in range(n_lights)]
     return unit_directions(vectors, Path("light_directions"), [None] * n_lights, rows)
 
@@ -199,5 +200,5 @@ def _checked_intensities(intensities: ArrayLike | None, n_lights: int) -> Float6
             f"found light intensities of shape {shape}, expected (F,) or (F, 3) with F = {n_lights}"
         )
     if not (np.isfinite(values) & (values > 0)).all():
-        raise InputError("a light intensity is not a finite number above 0")
+        raise InputError("found a light intensity that is not a finite number above 0")
     return np.broadcast_to(values, (n_lights, 3))

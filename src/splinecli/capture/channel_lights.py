@@ -3,7 +3,7 @@ under a different light.
 
 For a gray matte pixel with the scaled normal b, the three channels are I = M s, where s = (l_R . b,
 l_G . b, l_B . b). M is the crosstalk matrix: M[c, l] is the response of channel c to lamp l. The
-observations are s = inverse(M) I. A coloured surface also changes I, and this cannot be separated
+observations are s = inverse(M) I. The colour of a surface also affects I and cannot be separated
 from its shading.
 """
 
@@ -29,18 +29,18 @@ LARGEST_CONDITION = 30.0  # of a crosstalk matrix, which amplifies noise by abou
 
 @dataclass(frozen=True, eq=False)
 class ChannelLights:
-    """How F / 3 colour images become F observations. Observation i is channel i % 3 of image i //
-    3.
+    """The mapping from F / 3 colour images to F observations: channel i % 3 of image i // 3 is
+    observation i.
     """
 
     crosstalk: Float64Array  # (1, 3, 3) or (F / 3, 3, 3); see the module
-    measured: bool  # whether it was read from a file
+    measured: bool  # whether the crosstalk was read from a file
 
     def observe(
         self, path: Path, stored: Array, count: int, light: LightOf, index: int
     ) -> tuple[Array, int, LightOf]:
-        """Return one channel (P, 1) of the stored pixels and of the linear pixels, without
-        crosstalk; see pixel_reader.
+        """Return one channel (P, 1) of the stored pixels and, with the crosstalk removed, of the
+        linear pixels; see pixel_reader.
 
         Raises InputError for a gray image.
         """
@@ -49,7 +49,7 @@ class ChannelLights:
                 "the image is gray, but --lights-in-channels needs three channels, one for each"
                 " light",
                 path,
-                hint="Leave --lights-in-channels out",
+                hint="Omit --lights-in-channels",
             )
         channel = index % CHANNELS
         matrix = self.crosstalk[index // CHANNELS % len(self.crosstalk)]
@@ -62,15 +62,16 @@ class ChannelLights:
 
     def in_words(self) -> str:
         text = (
-            "The red, green and blue channels of each image are treated as photographs under three"
-            " lamps. This is only valid for gray objects: the normals of coloured objects are"
-            " wrong."
+            "The red, green and blue channels of each image are treated as separate photographs"
+            " under three lamps. This is valid only for gray objects; the normals of coloured"
+            " objects are wrong."
         )
         if self.measured:
             return text
         return (
-            f"{text} Without {CROSSTALK}, each channel is assumed to respond to its own lamp only;"
-            " measure the crosstalk with calibrate --gray-ball DIR --lights-in-channels."
+            f"{text} Because there is no {CROSSTALK}, each channel is assumed to respond only to"
+            " its own lamp. To measure the crosstalk, run calibrate --gray-ball DIR"
+            " --lights-in-channels."
         )
 
 
@@ -78,16 +79,16 @@ def check_crosstalk(matrix: Float64Array, path: Path) -> None:
     """Raise InputError if the lamps cannot be separated with this matrix (3, 3)."""
     if (matrix < 0).any():
         raise InputError(
-            f"found the negative response {matrix.min():g}, expected numbers of at least 0",
+            f"found a negative response ({matrix.min():g}), expected non-negative numbers",
             path,
         )
     condition = np.linalg.cond(matrix) if np.isfinite(matrix).all() else np.inf
     if condition > LARGEST_CONDITION:
-        number = f"the condition number {condition:.0f}" if condition < 1e6 else "no inverse"
+        number = f"a condition number of {condition:.0f}" if condition < 1e6 else "no inverse"
         raise InputError(
-            f"the channels do not separate the lamps, because the crosstalk matrix has {number}",
+            f"the lamps cannot be separated, because the crosstalk matrix has {number}",
             path,
-            hint="Use lamps with more distinct colours, for a condition number of at most"
+            hint="Use lamps with more distinct colours; the condition number must be at most"
             f" {LARGEST_CONDITION:.0f}",
         )
 
@@ -95,8 +96,8 @@ def check_crosstalk(matrix: Float64Array, path: Path) -> None:
 def channel_lights(path: Path | None, n_images: int) -> ChannelLights:
     """Return the crosstalk of n_images colour images.
 
-    The file has 3 lines for all images, or 3 lines for each image. Without a file, the channels are
-    assumed to be independent. Raises InputError.
+    The file has either 3 lines that apply to all images or 3 lines for each image. Without a file,
+    the channels are assumed to be independent. Raises InputError.
     """
     if path is None:
         return ChannelLights(np.eye(CHANNELS)[None], measured=False)
@@ -122,17 +123,17 @@ _REFERENCE = re.compile(
     r"(?<![a-z])(ref|reference|background|bg|empty|blank|flat|baseline|no[_-]?contact|untouched)"
     r"(?![a-z])"
 )
-_FLATTEST = 0.7  # largest gradients, relative to the gradients of the next flattest picture
-_UNCHANGED = 0.03  # natural logarithm of the largest ratio between equal pixels
-_LEAST_UNCHANGED = 0.3  # smallest share of pixels that are equal in another photograph
+_FLATTEST = 0.7  # largest mean gradient, relative to that of the next flattest picture
+_UNCHANGED = 0.03  # natural logarithm of the largest ratio at which pixels are considered equal
+_LEAST_UNCHANGED = 0.3  # smallest share of pixels that must be equal in every other photograph
 
 
 def find_reference(images: Sequence[Path]) -> Path | None:
-    """Return the picture of a tactile sensor without contact; None if it is ambiguous.
+    """Return the picture that a tactile sensor took without contact, or None if it is ambiguous.
 
-    If exactly one picture has a name such as "background", it is the reference. Otherwise, the
-    reference is clearly flatter than all other pictures, and equal to each of them in the many
-    pixels without contact. Raises InputError if an image cannot be read.
+    If exactly one picture has a name such as "background", it is the reference. Otherwise, it must
+    be clearly flatter than all other pictures and equal to each of them wherever there was no
+    contact. Raises InputError if an image cannot be read.
     """
     named = [image for image in images if _REFERENCE.search(image.stem.lower())]
     if named:

@@ -1,4 +1,4 @@
-"""The files of a capture. Names identify their roles, and stamps reveal changes."""
+"""The files of a capture: their names determine their roles, and stamps detect changes."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from splinecli.system.files import (
 
 _DEVELOPED = (".png", ".tif", ".tiff", ".bmp", ".tga")
 _JPEG = (".jpg", ".jpeg")
-# Treated as images only in a folder without others
+# Treated as images only if the folder contains no others
 _RARE = (".pgm", ".ppm", ".webp", ".avif", ".heic", ".heif")
 PICTURE_SUFFIXES = (*_DEVELOPED, *_JPEG, *_RARE)  # suffixes of pictures such as masks
-_KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # files of one photograph, the best kind first
+_KINDS = (_DEVELOPED, RAW_SUFFIXES, _JPEG, _RARE)  # of one photograph, the best kind first
 # Suffixes of images of an object
 IMAGE_SUFFIXES = tuple(suffix for suffixes in _KINDS for suffix in suffixes)
 
@@ -51,16 +51,17 @@ GROUND_TRUTH = tuple(
     for stem in ("normal_gt", "normals_gt", "gt_normal", "gt_normals")
 )
 
-# Names of subfolders for the images of a capture, whose other files are in the parent folder.
-# PSBox uses the first name.
+# Subfolders that may hold a capture's images while its other files are in the parent folder. PSBox
+# uses the first name.
 IMAGE_FOLDERS = ("Objects", "objects", "images", "Images")
 NOT_PHOTOGRAPHS = frozenset(
     Path(name).stem
     for name in (*MASK, *AMBIENT, *GROUND_TRUTH, *own_files(), *FOUND_LIGHTS, *PLOTS)
     if Path(name).suffix in IMAGE_SUFFIXES
 )
-"""Lower-case stems of pictures that do not show the object under one light. They include results,
-which may be written to the capture's folder."""
+"""Lower-case stems of pictures that are not photographs under one light. They include results,
+which may have been written to the capture's folder.
+"""
 
 
 class NoImagesError(InputError):
@@ -69,14 +70,14 @@ class NoImagesError(InputError):
 
 def natural_key(path: Path) -> tuple[list[int | str], str]:
     """Return a sort key that compares numbers by value, so that img2 comes before img10."""
-    # split() with a group alternates text and digits, so equal positions have equal types.
+    # With a group, split() alternates text and digits, so items at equal positions can be compared.
     parts = enumerate(re.split(r"([0-9]+)", path.name.casefold()))
     return [int(part) if place % 2 else part for place, part in parts], path.name
 
 
 # Words in the names of pictures that are not photographs
 ROLES = {
-    # also faceMask and facemask, but not damask
+    # matches faceMask and facemask, but not damask
     "mask": re.compile(r"((?<![a-z])m|(?<=[a-z])M)asks?(?![a-z])|(?<=[a-z])(?<!da)masks?$"),
     "ambient": re.compile(r"(?<![a-z])ambient(?![a-z])"),
 }
@@ -85,7 +86,7 @@ ROLES = {
 def has_role(path: Path, role: str) -> bool:
     """Return whether a picture's name contains the word "mask" or "ambient", as in NAME_mask.png.
 
-    Names that are reserved for other files are excluded.
+    Names reserved for other files do not count.
     """
     if path.suffix.lower() not in PICTURE_SUFFIXES or path.stem.lower() in NOT_PHOTOGRAPHS:
         return False
@@ -93,10 +94,10 @@ def has_role(path: Path, role: str) -> bool:
 
 
 def list_folder(folder: Path) -> list[Path]:
-    """Return the visible content of a folder in natural order.
+    """Return the visible entries of a folder in natural order.
 
-    Hidden files are skipped because macOS writes "._" companions of images. Raises InputError if
-    the folder is missing, is a file, or cannot be read.
+    Hidden files are skipped, because macOS writes a "._" companion next to each image. Raises
+    InputError if the folder is missing, is a file, or cannot be read.
     """
     mode = find_mode(folder)
     if mode is None:
@@ -120,11 +121,11 @@ def list_images(
 ) -> tuple[Path, ...]:
     """Return the images in a folder, identified by their suffixes, in natural order.
 
-    Files with the same stem are assumed to show the same photograph. A PNG or TIFF file was
-    developed from the RAW file and replaces it. A JPEG file is ignored, because it is usually a
-    copy made by the camera or a viewer. Files with another role are excluded: because of their
-    lower-case stem, such as "mask"; because the user named them; or because their names contain the
-    word of a role, unless the names of all images do.
+    Files with the same stem are assumed to show the same photograph. A PNG or TIFF file takes
+    precedence over a RAW file, from which it was probably developed. A JPEG file is ignored,
+    because it is usually a copy made by the camera or a viewer. Files with another role are
+    excluded: those whose lower-case stem is in leave_out_stems, such as "mask"; those that the user
+    named; and those whose names contain the word of a role, unless the names of all images do.
     """
     others = {resolve(path) for path in leave_out}
     images = [
@@ -152,7 +153,7 @@ def list_images(
 
 
 def check_not_empty(images: Sequence[Path], folder: Path) -> None:
-    """Raise NoImagesError if there are no images."""
+    """Raise NoImagesError if the folder contains no images."""
     if not images:
         suffixes = Counter(
             path.suffix.lower() for path in list_folder(folder) if path.suffix and not path.is_dir()
@@ -177,7 +178,7 @@ def check_not_empty(images: Sequence[Path], folder: Path) -> None:
 
 
 def read_image_list(path: Path) -> tuple[Path, ...]:
-    """Return the images listed in a filenames.txt, one on each line, relative to its folder.
+    """Return the images listed in a filenames.txt, one per line, relative to its folder.
 
     Raises InputError if the list is empty, or with the line if an image is listed twice or does not
     exist.
@@ -188,14 +189,15 @@ def read_image_list(path: Path) -> tuple[Path, ...]:
         if not name:
             continue
         places = (path.parent / each / name for each in ("", *IMAGE_FOLDERS))
-        # Path.exists raises for a name that is too long
+        # Path.exists raises an error for a name that is too long
         image = next(filter(os.path.exists, places), None)
         if Path(name).is_absolute() or ".." in Path(name).parts:
             raise InputError(
                 f'the image "{name}" is outside the folder of the list',
                 path,
                 line=line,
-                hint="Copy the image into the folder or link to it from there, and list that name",
+                hint="Copy the image into the folder, or create a link to it there, and list that"
+                " name",
             )
         if image is None:
             raise InputError(
@@ -237,8 +239,8 @@ def find_images(
 
 
 def list_stack(folder: Path) -> tuple[Path, ...]:
-    """Return the photographs in the only .mat file of a folder, such as a.mat[0]; empty without
-    one.
+    """Return the photographs in the only .mat file of a folder, such as a.mat[0], or an empty tuple
+    without such a file.
 
     Raises InputError if several files contain photographs.
     """
@@ -255,7 +257,7 @@ def list_stack(folder: Path) -> tuple[Path, ...]:
             f"found {len(found)} .mat files with photographs ({short_list([*found])}), expected"
             " one",
             folder,
-            hint="Put each capture into its own folder",
+            hint="Put each capture in its own folder",
         )
     if unread is not None and not found:
         raise unread
@@ -265,7 +267,7 @@ def list_stack(folder: Path) -> tuple[Path, ...]:
 
 
 def short_list(paths: Sequence[Path], most: int = 3) -> str:
-    """Return the names of the first files, for a message."""
+    """Return the names of the first files, for use in a message."""
     return ", ".join(path.name for path in paths[:most]) + (", ..." if len(paths) > most else "")
 
 
@@ -277,28 +279,28 @@ class CaptureFiles:
     name: str  # name of the capture, usually the folder's name
     folder: Path  # the folder that contains the other files
     images: tuple[Path, ...]
-    # F x 3 text, or a file that names the images and so defines their order. None if no lights are
-    # needed
+    # F x 3 text, or a file that names the images and thereby defines their order. None if no lights
+    # are needed
     light_directions: Path | None
-    light_intensities: Path | None = None  # F x 3 text, or None without such a file
+    light_intensities: Path | None = None  # F x 3 text, or None if there is no such file
     mask: Path | None = None  # an image, or None to use every pixel
     ground_truth: Path | None = None  # a normal map, or None
     # used instead of a mask: the object is the union of the non-zero pixels of these images
     boundaries: tuple[Path, ...] = ()
-    ambient: Path | None = None  # an image under none of the lights, or None
-    # pictures next to the images that are not photographs according to their names
+    ambient: Path | None = None  # an image taken with all lights off, or None
+    # pictures next to the images whose names show that they are not photographs
     others: tuple[Path, ...] = ()
-    # zero-based positions of the images in the light file; None for all
+    # zero-based positions of the images in the light file, or None if it has no others
     kept: tuple[int, ...] | None = None
-    warnings: tuple[CaptureWarning, ...] = ()  # report choices among files with unusual names
+    warnings: tuple[CaptureWarning, ...] = ()  # about choices among files with unusual names
 
 
 @dataclass(frozen=True)
 class Overrides:
     """Files named by the user, which take precedence over the files in the folder.
 
-    If needs_lights is false, light files in the folder are ignored, and a missing one is not an
-    error.
+    If needs_lights is false, light files in the folder are ignored, and it is not an error if there
+    are none.
     """
 
     lights: Path | None = None
@@ -317,8 +319,8 @@ class Overrides:
 
 
 def find_named(folder: Path, names: Sequence[str]) -> Path | None:
-    """Return the file in the folder that has the first of these names, ignoring case; None if none
-    exists.
+    """Return the first file in the folder with one of these names, ignoring case, or None. Earlier
+    names take precedence.
     """
     entries = {entry.name.lower(): entry for entry in list_folder(folder)}
     files = (entries[name] for name in names if name in entries)
@@ -326,7 +328,7 @@ def find_named(folder: Path, names: Sequence[str]) -> Path | None:
 
 
 def folder_name(folder: Path) -> str:
-    """Return the name of a folder, even if it is given as ".", ".." or with a trailing slash.
+    """Return the name of a folder, even if its path is ".", ".." or ends with a slash.
 
     A link keeps its own name. Raises InputError.
     """
@@ -339,10 +341,10 @@ def stamp_files(
 ) -> tuple[Any, ...]:
     """Return JSON values that change whenever a file of the capture changes.
 
-    Compute them before reading the files. Images and flat fields are stamped by path, size and
-    modification time, because reading them is slow. All other files (lights, intensities, mask,
-    ground truth, ambient image) are stamped by their content. Raises InputError if a file cannot be
-    read.
+    Compute them before reading the files. Images and flat fields are stamped with their path, size
+    and modification time, because reading them is slow. All other files (lights, intensities, mask,
+    ground truth, ambient image) are stamped with their content. Raises InputError if a file cannot
+    be read.
     """
     lights = files.light_directions, files.light_intensities
     small = *files.boundaries, *lights, files.mask, files.ground_truth, files.ambient
@@ -357,7 +359,7 @@ def stamp_files(
 
 
 def stamp_content(path: Path) -> Any:
-    """Return the SHA-256 of a file, or for more than 64 MiB its path, size and modification time.
+    """Return the SHA-256 of a file or, above 64 MiB, its path, size and modification time.
 
     Raises InputError.
     """

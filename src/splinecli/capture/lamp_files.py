@@ -1,5 +1,5 @@
-"""The files and options of near lamps and of the camera: positions, lobes, the size of a pixel, and
-the light.mat and camera.mat of near_ps.
+"""Files and options that describe near lamps and the camera: positions, lobes, the pixel size, and
+the light.mat and camera.mat files of near_ps.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from splinecli.system.files import is_found_file, is_substitution
 
 
 def positions_as_directions(path: Path) -> list[CaptureWarning]:
-    """Return a warning if the vectors of a text file of directions have lengths typical of
+    """Return a warning if the vectors in a text file of directions have lengths typical of
     positions.
     """
     if is_substitution(path) or format_of(path).read != FORMATS[0].read:
@@ -44,9 +44,9 @@ def positions_as_directions(path: Path) -> list[CaptureWarning]:
     if len(lengths) < 3 or lengths.min() < 3.0 or lengths.max() < 1.02 * lengths.min():
         return []
     text = (
-        f"{path.name} is read as light directions, but its vectors have lengths from"
-        f" {lengths.min():.4g} to {lengths.max():.4g}, which is typical of lamp positions. If they"
-        " are positions, use --light-positions."
+        f"{path.name} was read as light directions, but the lengths of its vectors, from"
+        f" {lengths.min():.4g} to {lengths.max():.4g}, are typical of lamp positions. If they are"
+        " positions, use --light-positions."
     )
     return [CaptureWarning(NEAR_LAMPS, text)]
 
@@ -56,28 +56,28 @@ class LampOptions:
     """The user's options for near lamps and the camera. All lengths are in one unit, such as
     millimetres.
 
-    Positions replace a distance, and a pixel size the object's width. Raises UsageError for a
-    distance without the size of a pixel.
+    Positions take precedence over a distance, and a pixel size over the object's width. Raises
+    UsageError if a distance is given without a pixel size or an object width.
     """
 
     positions: str | None = None  # a file of lamp positions, which replaces the light file
     distance: float | None = None  # from the middle of the object to every lamp
     pixel_size: float | None = None  # the width of a pixel on the object's mean plane
-    # whether the pixel size is also used to scale the surface, and so is valid without lamps
+    # whether the pixel size is also used to scale the surface, so that it is valid without lamps
     scales_surface: bool = False
-    object_width: float | None = None  # from the first to the last column of the mask
+    object_width: float | None = None  # the width from the first to the last column of the mask
     camera_matrix: str | None = None  # a file with the 3 x 3 camera matrix in pixels
 
     def __post_init__(self) -> None:
         if self.distance is not None and self.pixel_size is None and self.object_width is None:
             raise UsageError(
-                "--light-distance needs the size of a pixel",
+                "--light-distance requires the size of a pixel",
                 hint="Add --pixel-size or --object-width",
             )
 
     @property
     def given(self) -> str | None:
-        """The first option that needs near lamps, as the user wrote it; None if there is none."""
+        """The first option that requires near lamps, as the user wrote it, or None."""
         names = [name for name in _OPTIONS if not (name == "pixel_size" and self.scales_surface)]
         return next((_OPTIONS[name] for name in names if getattr(self, name) is not None), None)
 
@@ -111,20 +111,20 @@ class Lit(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class LampFiles:
-    """Near lamps as described by files and options, before the lights and the images are read."""
+    """Near lamps as described by files and options, before the lights and images are read."""
 
-    # the file of positions, or None if `distance` puts the lamps in the light directions
+    # the file of positions, or None if the lamps are at `distance` in the light directions
     positions: Path | None
     options: LampOptions
-    # from the options or a file. If the scale is unknown, this and the object's width are None
+    # from the options or a file. Both this and the object's width are None if the scale is unknown
     pixel_size: float | None
     lobes: Path | None  # the file of the lamps' lobes, or None
-    stamp: tuple[Any, ...]  # of the files that were found, computed before they were read
-    # whether the capture uses the lamps. If not, they are only compared with distant lights
+    stamp: tuple[Any, ...]  # of the files found, computed before they were read
+    # whether the capture uses the lamps; otherwise, they are only compared with distant lights
     used: bool
 
     def in_words(self) -> str:
-        """Return a description of the lamps and of their source."""
+        """Return a description of the lamps and where they come from."""
         if not self.used:
             return f"{self.positions} is not used"
         text = f"near, as in {self.positions}"
@@ -148,7 +148,7 @@ class LampFiles:
         else:
             assert self.options.distance is not None
             positions = source.light_directions * self.options.distance
-        # float32 holds the squares of distances up to 1e19.
+        # float32 can represent the squares of distances up to 1e19.
         if (farthest := np.abs(positions).max(initial=0)) > 1e15:
             raise InputError(
                 f"a lamp is {farthest:.3g} away, expected at most 1e15",
@@ -179,7 +179,7 @@ class LampFiles:
 
 
 def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampFiles | None:
-    """Return the near lamps described by the capture's folder and the options; None without any.
+    """Return the near lamps described by the capture's folder and the options, or None.
 
     A file of positions in the folder is used unless the user passes `lights`, a file of distant
     lights. If `lights` is given or the scale is unknown, the positions are returned but not used.
@@ -201,8 +201,9 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
             if options.given is None:
                 return None
             raise UsageError(
-                f"{options.given} needs near lamps, but {folder} has no {LIGHT_POSITIONS[0]}",
-                hint="Add --light-positions FILE or --light-distance D, or leave the option out",
+                f"{options.given} requires near lamps, but {folder} contains no"
+                f" {LIGHT_POSITIONS[0]}",
+                hint="Add --light-positions FILE or --light-distance D, or omit the option",
             )
     scaled = options.pixel_size is not None or options.object_width is not None
     pixel_file = None if scaled else _find("pixel_size.txt", folder, positions)
@@ -214,9 +215,7 @@ def find_lamps(folder: Path, lights: Path | None, options: LampOptions) -> LampF
     pixel_size = options.pixel_size if pixel_file is None else _read_pixel_size(pixel_file)
     only = find_light_file(folder), _path(options.positions), lobes
     if used and not scaled and positions in only:
-        hint = (
-            "Add --pixel-size or --object-width, or write the width of a pixel into pixel_size.txt"
-        )
+        hint = "Add --pixel-size or --object-width, or write the width of a pixel to pixel_size.txt"
         if positions == lobes:
             hint = (
                 "Add --pixel-size: the distance from the camera to the object divided by the"
@@ -261,14 +260,14 @@ def read_camera_matrix(path: Path) -> Float64Array:
             path,
             hint="A camera matrix has the rows fx 0 cx, 0 fy cy and 0 0 1, in pixels",
         )
-    ray_basis(matrix)  # rejects other numbers
+    ray_basis(matrix)  # rejects invalid matrices
     return matrix
 
 
 def _read_lobes(path: Path, positions: Float64Array, frame: LightFrame) -> Float64Array:
     """Return the lobes (F, 4) of lamps at positions (F, 3), as in NearLamps. Raises InputError."""
     hint = (
-        "Each line has the direction x y z in which a lamp is brightest, and its exponent mu from"
+        "Each line gives the direction x y z in which a lamp is brightest, and its exponent mu from"
         " 0 to 100"
     )
     if is_near_ps(path):
@@ -281,7 +280,7 @@ def _read_lobes(path: Path, positions: Float64Array, frame: LightFrame) -> Float
             f"found {len(rows)} lines, expected 1 or {len(positions)}", path, hint=hint
         )
     for numbers, line, text in rows:
-        # With an exponent of 100, the intensity halves 7 degrees off the axis.
+        # With an exponent of 100, the intensity falls to half 7 degrees off the axis.
         if len(numbers) != 4 or not any(numbers[:3]) or not 0 <= numbers[3] <= 100:
             raise InputError(f'found "{text[:60]}", expected x y z mu', path, line=line, hint=hint)
     rows *= len(positions) // len(rows)
@@ -300,9 +299,9 @@ def _read_lobes(path: Path, positions: Float64Array, frame: LightFrame) -> Float
 
 
 def is_near_ps(path: Path) -> bool:
-    """Return whether a file is a light.mat of near_ps (Y. Quéau).
+    """Return whether a file is a light.mat in the format of near_ps (Y. Quéau).
 
-    It contains the positions S and the axes Dir of lamps, in the frame of OpenCV's camera.
+    Such a file contains the positions S and axes Dir of the lamps, in OpenCV's camera frame.
     """
     with suppress(InputError):
         return path.suffix.lower() == ".mat" and is_found_file(path) and {"S", "Dir"} <= names(path)
@@ -327,14 +326,14 @@ def _rows_of(path: Path, name: str, n_columns: int = 3) -> Float64Array:
 def near_ps_frame(
     lamps: LampFiles, camera_matrix: Float64Array | None, shape: Sequence[int]
 ) -> LightFrame:
-    """Return the frame of near_ps positions for images of shape (H, W).
+    """Return the frame of near_ps lamp positions for images of shape (H, W).
 
     Raises InputError without a camera matrix or a pixel size.
     """
     if camera_matrix is None or lamps.pixel_size is None:
         raise InputError(
-            "the positions are relative to the camera, so its matrix and the size of a pixel are"
-            " needed",
+            "the positions are relative to the camera, so the camera matrix and the size of a pixel"
+            " are needed",
             lamps.positions,
             hint="Add --camera-matrix and --pixel-size",
         )
@@ -348,7 +347,7 @@ def near_ps_frame(
 def near_ps_intensities(path: Path, frame: LightFrame) -> Float64Array | None:
     """Return the light intensities (F, 3) of near_ps lamps at the origin, computed from Phi.
 
-    None if the file has no Phi. Raises InputError.
+    Return None if the file has no Phi. Raises InputError.
     """
     if "Phi" not in names(path):
         return None
@@ -373,7 +372,7 @@ def _read_pixel_size(path: Path) -> float:
             f'found "{text[:40]}", expected one number above 0, the width of a pixel',
             path,
             line=line,
-            hint="Write only the number, in the unit of the lamps' positions",
+            hint="Write only the number, in the unit of the lamp positions",
         )
     return size
 

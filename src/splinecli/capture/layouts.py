@@ -1,10 +1,10 @@
-"""Find the files of a capture in a folder, and the captures of a dataset, by trying one layout
+"""Find the files of a capture in a folder, and the captures in a dataset, by trying one layout
 after another.
 
-In the layout of CyclesPS (Ikehata, ECCV 2018), an object has folders images_<kind>/ and files that
-all kinds share. In the published tree, PRPS/<object> contains images_specular and images_metallic,
-and PRPS_Diffuse/<object> contains images_diffuse. Each of these folders is a capture with one
-image, 00000.tif and so on, for each line of the object's light.txt.
+In CyclesPS (Ikehata, ECCV 2018), an object has folders images_<kind>/ and files shared by all
+kinds. In the published tree, PRPS/<object> contains images_specular and images_metallic, and
+PRPS_Diffuse/<object> contains images_diffuse. Each of these folders is a capture with one image,
+00000.tif and so on, for each line of the object's light.txt.
 """
 
 import re
@@ -38,8 +38,8 @@ _BOUNDARIES = ("inboundary.png", "onboundary.png")
 def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFiles | None:
     """Return the files of a folder images_<kind>, or of an object with only one such folder.
 
-    None for another layout. Raises InputError if a file is missing, there are several such folders,
-    or the images do not match the lights.
+    Return None for any other layout. Raises InputError if a file is missing, if there are several
+    such folders, or if the images do not match the lights.
     """
     captures = list_cyclesps(folder)
     if captures is None:
@@ -64,14 +64,14 @@ def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFile
             hint="Pass --lights FILE, with one line x y z for each image",
         )
     images = _list_numbered(images_folder, len(read_light_directions(lights)), lights)
-    # The object is the union of both masks, so one alone would be wrong.
+    # The object is the union of both masks, so a single one would be wrong.
     masks = (
         {} if overrides.mask else {name: files.find_named(holder, [name]) for name in _BOUNDARIES}
     )
     if missing := [name for name, path in masks.items() if path is None]:
         raise InputError(
-            f"found no {' and no '.join(missing)}, but both masks are needed: their union is the"
-            " object",
+            f"found no {' and no '.join(missing)}, but both masks are needed, because the object is"
+            " their union",
             holder,
             hint="Pass --mask FILE",
         )
@@ -91,7 +91,7 @@ def find_cyclesps(folder: Path, overrides: files.Overrides) -> files.CaptureFile
 def list_cyclesps(folder: Path) -> list[Path] | None:
     """Return the folders of images of a CyclesPS object, or the folder itself if it is one of them.
 
-    None for another layout.
+    Return None for any other layout.
     """
     is_images_folder = files.folder_name(folder).startswith(_PREFIX) and _has_marks(_parent(folder))
     usual_lights = [name for each in FORMATS if not each.rank for name in each.found]
@@ -117,7 +117,7 @@ def _name(images_folder: Path) -> str:
 def _has_marks(folder: Path) -> bool:
     """Return whether the folder contains at least two of the four files that identify CyclesPS.
 
-    Some may be missing, but no other dataset has two of them.
+    Two are enough, because no other dataset has two of them and some may be missing.
     """
     marks = {"light.txt", "gt_normal.tif", *_BOUNDARIES}
     names = {entry.name.lower() for entry in files.list_folder(folder) if not is_folder(entry)}
@@ -125,12 +125,12 @@ def _has_marks(folder: Path) -> bool:
 
 
 def _parent(folder: Path) -> Path:
-    # "." and ".." are their own parents to pathlib.
+    # pathlib treats "." and ".." as their own parents.
     return folder.parent if folder.name not in ("", "..") else resolve(folder).parent
 
 
 def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...]:
-    """Return the images 00000.tif and so on, one for each light."""
+    """Return the images 00000.tif, 00001.tif and so on, one for each light."""
     there = {entry.name.lower(): entry for entry in files.list_folder(folder)}
     wanted = [f"{index:05}.tif" for index in range(n_lights)]
     expected = f"{n_lights} ({wanted[0]} to {wanted[-1]}), one for each light in {lights.name}"
@@ -145,7 +145,7 @@ def _list_numbered(folder: Path, n_lights: int, lights: Path) -> tuple[Path, ...
 
 # The light file of PSBox (Y. Xiong), whose images are in the folder Objects
 _PSBOX_LIGHTS = ("light_directions.txt",)
-# Words in the names of pictures that other programs write next to the photographs.
+# Words in the names of pictures that other programs write next to photographs
 _IMAGE_FOLDERS = ("images", "image", "imgs", "img", "photos", "photographs", "pictures", "objects")
 _OTHER_WORDS = frozenset({"mask", "normal", "normals", "albedo", "ambient", "all", "depth"})
 
@@ -157,17 +157,17 @@ def _is_other(image: Path, words: frozenset[str] = _OTHER_WORDS) -> bool:
 def find_capture_files(
     folder: StrPath, overrides: files.Overrides | None = None
 ) -> files.CaptureFiles:
-    """Return the files of the capture in a folder. Overrides take precedence over its own files.
+    """Return the files of the capture in a folder. Overrides take precedence over them.
 
     Raises InputError if the folder is missing, is a file or contains no images; if filenames.txt
-    lists an image that does not exist; if the light file is missing; or if a file of the overrides
-    does not exist.
+    lists an image that does not exist; if the light file is missing; or if an override does not
+    exist.
     """
     folder, overrides = Path(folder), overrides or files.Overrides()
     files.list_folder(folder)  # raises if it is not a folder
     overrides.named()
     try:
-        # The plain folder comes last, because it accepts any folder with images.
+        # The plain layout comes last, because it accepts any folder with images.
         return (
             _find_psbox(folder, overrides)
             or find_cyclesps(folder, overrides)
@@ -180,12 +180,12 @@ def find_capture_files(
         raise InputError(
             error.problem,
             folder,
-            hint=f"Pass one of the captures in {folder}, such as {captures[0]}",
+            hint=f"Pass one of the captures inside {folder}, such as {captures[0]}",
         ) from None
 
 
 def capture_name(folder: StrPath) -> str:
-    """Return the capture's name: its folder or video, or for CyclesPS <object>_<kind>.
+    """Return the capture's name: the name of its folder or video, or <object>_<kind> for CyclesPS.
 
     Raises InputError.
     """
@@ -193,7 +193,7 @@ def capture_name(folder: StrPath) -> str:
     if is_film(folder):
         return folder.stem
     captures = None
-    with suppress(InputError):  # reading the capture raises it again
+    with suppress(InputError):  # raised again when the capture is read
         captures = list_cyclesps(folder) if is_folder(folder) else None
     return _name(captures[0]) if captures and len(captures) == 1 else _own_name(folder)
 
@@ -208,7 +208,7 @@ def _own_name(folder: Path) -> str:
 
 
 def _images_folder(folder: Path) -> Path | None:
-    """Return the subfolder with the images of a capture; None if the images are not in a
+    """Return the subfolder that contains the images of a capture, or None if they are not in a
     subfolder.
     """
     inside = next((path for name in files.IMAGE_FOLDERS if is_folder(path := folder / name)), None)
@@ -223,10 +223,10 @@ def _images_folder(folder: Path) -> Path | None:
 
 
 def _holder(folder: Path) -> Path:
-    """Return the parent of a folder named `images` or similarly, unless the folder has its own
+    """Return the parent of a folder called `images` or similar, unless the folder has its own
     lights.
 
-    Other folders are returned as they are.
+    Any other folder is returned unchanged.
     """
     around, name = _parent(folder), files.folder_name(folder)
     if name.lower() not in _IMAGE_FOLDERS or has_lights(folder):
@@ -239,14 +239,15 @@ def _holder(folder: Path) -> Path:
 
 
 def find_captures(folder: StrPath) -> list[Path]:
-    """Return the captures of a dataset in natural order; only the folder itself if it is a capture.
+    """Return the captures of a dataset in natural order, or only the folder itself if it is a
+    capture.
 
     A capture is a folder of images with a light file, a folder with a light file and a subfolder
-    Objects of images (PSBox), or a folder of images of a CyclesPS object. A CyclesPS object and the
-    published tree are datasets, too. Captures are identified by the names of their files, so
-    reading one may still fail. A subfolder that cannot be listed is treated as a capture, so that
-    the caller reports the error when reading it. Raises InputError if the folder is missing, is a
-    file, or contains no capture.
+    Objects that contains the images (PSBox), or an images_<kind> folder of a CyclesPS object. A
+    CyclesPS object and the published tree are datasets as well. Captures are recognised by the
+    names of their files, so reading one may still fail. A subfolder that cannot be listed is
+    treated as a capture, so that the error is reported when the caller reads it. Raises InputError
+    if the folder is missing, is a file, or contains no capture.
     """
     folder = Path(folder)
     inside = _subfolders(folder)
@@ -289,9 +290,7 @@ def _captures_in(folder: Path) -> list[Path]:
 
 
 def _captures_below(folder: Path) -> list[Path]:
-    """Return the captures in a folder, and in its subfolders for the first level of CyclesPS's
-    tree.
-    """
+    """Return the captures in a folder, or in the subfolders of a top-level folder of CyclesPS."""
     try:
         if folder.name in ("PRPS", "PRPS_Diffuse"):
             return [capture for path in _subfolders(folder) for capture in _captures_in(path)]
@@ -312,10 +311,10 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
     listed = files.find_named(folder, [files.FILENAMES]) is not None
     of_images = folder if listed else _images_folder(folder) or folder
     images, _ = files.find_images(of_images, leave_out=overrides.named())
-    # Without a light file, the number of photographs is unknown.
+    # Fewer words are excluded if a light file gives the number of photographs.
     words = _OTHER_WORDS if overrides.needs_lights else _OTHER_WORDS | {"demo", "result", "results"}
     others = tuple(image for image in images if _is_other(image, words))
-    if listed or len(others) > 0.25 * len(images):  # too many: they are photographs
+    if listed or len(others) > 0.25 * len(images):  # so many must be photographs
         others = ()
     images = tuple(image for image in images if image not in others)
     lights = overrides.lights or (find_light_file(folder) if overrides.needs_lights else None)
@@ -326,7 +325,7 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
         raise _no_lights(folder, images)
     layout, ground_truth = "plain folder", files.GROUND_TRUTH
     if listed and files.find_named(folder, ["light_directions.txt"]) is not None:
-        # normal.txt comes last, because harvestPNG's is upside down, while its .mat is correct.
+        # normal.txt comes last, because in harvestPNG it is upside down, unlike the .mat file.
         layout, ground_truth = "DiLiGenT", (*files.GROUND_TRUTH, "normal.txt")
     found = _gather(layout, folder, images, lights, overrides, ground_truth, others)
     of_copies = () if listed else copies(images)
@@ -334,36 +333,35 @@ def _find_plain(folder: Path, overrides: files.Overrides) -> files.CaptureFiles:
 
 
 def _no_lights(folder: Path, images: Sequence[Path]) -> InputError:
-    """Return the error for a capture without a light file, with a hint about the options for
-    reading it.
+    """Return the error for a capture without a light file, with a hint on how to read it.
 
     If the lights can be estimated from the images, the error is a NoLightsError. Raises InputError
-    if a file of lights does not fit the images.
+    if there is a light file that does not fit the images.
     """
     count = "1 image" if len(images) == 1 else f"{len(images)} images"
     problem = f"found {count} ({files.short_list(images)}) but no light file"
     if len(images) < MIN_LIGHTS:
         option = None
-        with suppress(InputError):  # a file with other numbers of lights is none for these images
+        with suppress(InputError):  # its number of lights may belong to other images
             option = light_option(folder, (*images,) * CHANNELS)
         hint = (
-            "A normal needs at least three photographs under different lights; for a colour"
+            "Normals require at least three photographs under different lights; for a colour"
             f" photograph under three coloured lamps, add --lights-in-channels {option or ''}"
         )
         return InputError(problem, folder, hint=hint.rstrip())
     if option := light_option(folder, images):
         return InputError(problem, folder, hint=f"Add {option}")
     hint = (
-        "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' creates"
-        " this file from images of a mirror ball. Without one, --lights estimate finds the lights"
-        " from the images, with lower accuracy. These light files are found by name:"
-        f" {light_names()}"
+        "Pass --lights FILE, with one line x y z for each image. 'splinecli calibrate' creates this"
+        " file from images of a mirror ball. Without a light file, --lights estimate estimates the"
+        " lights from the images, with lower accuracy. Light files with these names are found"
+        f" automatically: {light_names()}"
     )
     return NoLightsError(problem, folder, hint=hint)
 
 
 def _find_psbox(folder: Path, overrides: files.Overrides) -> files.CaptureFiles | None:
-    """Return the files of a PSBox capture, whose images are in a subfolder; None for another
+    """Return the files of a PSBox capture, whose images are in a subfolder, or None for any other
     layout.
     """
     lights = overrides.lights or files.find_named(folder, _PSBOX_LIGHTS)
@@ -384,7 +382,7 @@ def _gather(
     ground_truth: Sequence[str] = files.GROUND_TRUTH,
     others: tuple[Path, ...] = (),
 ) -> files.CaptureFiles:
-    """Return the capture's images and lights with the optional files in the folder.
+    """Return the capture's images and lights together with the optional files in the folder.
 
     Files named by the user take precedence over files in the folder.
     """

@@ -1,11 +1,11 @@
-"""Light files: the table of their formats, light directions and intensities, and lights that name
-their images.
+"""Light files: the table of their formats, and readers of light directions and intensities for the
+images of a capture.
 
 Frame: x right, y up, z to the camera; a direction points from the object to the light.
 
-Image names in a light file often come from another machine, where the folders differ, or are only
-numbers. Therefore, the images in the folder are matched by base name, then by name without suffix,
-then by order.
+Image names in a light file are often just numbers, or contain folders of another machine.
+Therefore, the images in the folder are matched by base name, then by name without suffix, then by
+order.
 """
 
 import io
@@ -26,11 +26,11 @@ from splinecli.maths import Bools, Float64Array
 from splinecli.maths.normals import unit
 from splinecli.system.files import StrPath, is_folder
 
-_FILE = "a text file with a line {} for each image"
+_FILE = "a text file with one line {} for each image"
 
 
 class WrongCountError(InputError):
-    """A light file has n_found lights, which is not the number of images."""
+    """A light file contains n_found lights, but the number of images differs."""
 
     n_found = 0
 
@@ -61,15 +61,15 @@ def _encode_npy(directions: Float64Array, images: Sequence[Path]) -> bytes:
 
 @dataclass(frozen=True)
 class LightFormat:
-    """A format of light files. To add one, write its reader and a row of FORMATS."""
+    """A format of light files. To add a format, write a reader and add a row to FORMATS."""
 
     name: str  # for messages
-    # in lower case; empty for the format of all other suffixes
+    # in lower case; empty for the format used for all other suffixes
     suffixes: tuple[str, ...]
     read: Callable[[Path, int | None, RowForm], NumberRows]  # see light_formats
-    # names under which a light file is found in a folder, in any case; "*" stands for any text
+    # names by which a light file is found in a folder, ignoring case; "*" stands for any text
     found: tuple[str, ...]
-    # A lower rank takes precedence. Within rank 0, the first name wins; within another rank, two
+    # Lower ranks take precedence. Within rank 0, the first name wins; within any other rank, two
     # files are an error
     rank: int = 0
     # from directions (F, 3); None for a format that is only read
@@ -114,11 +114,13 @@ FORMATS = (
         2,
     ),
 )
-"""All formats of light files. This table defines how they are named, found, read and written."""
+"""All formats of light files, with the names by which they are found, and how to read and write
+them.
+"""
 
 
 def format_of(path: Path) -> LightFormat:
-    """Return the format of a light file, which is text for an unknown suffix."""
+    """Return the format of a light file from its suffix; an unknown suffix means text."""
     return next((each for each in FORMATS if path.suffix.lower() in each.suffixes), FORMATS[0])
 
 
@@ -136,11 +138,11 @@ def read_light_directions(
 ) -> Float64Array:
     """Return unit light directions (F, 3) float64 from a light file, in the order of the file.
 
-    Each row contains x y z, separated by spaces, tabs, commas or semicolons. Both a header, which
-    may name the columns in another order, and a first line with only the number of lights are
-    accepted (as in the University of Washington's lights.txt). If N x 3 does not fit, the file is
-    read as 3 x N (PSBox); 3 x 3 is read as rows. If the first column numbers the rows from 0 or 1,
-    it determines their order. Vectors may have any length above zero.
+    Each row contains x y z, separated by spaces, tabs, commas or semicolons. The rows may be
+    preceded by a header, which may name the columns in another order, or by a line with only the
+    number of lights (as in the University of Washington's lights.txt). If the file is not N x 3, it
+    is read as 3 x N (PSBox); 3 x 3 is read as rows. If the first column numbers the rows from 0 or
+    1, it determines their order. Vectors may have any length above zero.
 
     Args:
         n_images: the expected number of lights, if it is known.
@@ -148,8 +150,8 @@ def read_light_directions(
 
     Raises:
         InputError: with the line, for a wrong number of columns, a word that is not a finite
-            number, a zero vector or a light below the horizon; also if the count disagrees with the
-            count line or with n_images, and for angles that are read as vectors.
+            number, a zero vector or a light below the horizon; also if the number of lights differs
+            from the count line or n_images, and for angles that would be read as vectors.
     """
     path = Path(path)
     return lights_of(format_of(path).read(path, n_images, form), n_images, frame, form)[1]
@@ -158,10 +160,10 @@ def read_light_directions(
 def read_light_positions(
     path: StrPath, n_images: int, frame: LightFrame = USUAL_FRAME
 ) -> Float64Array:
-    """Return the positions of lamps (F, 3) float64 from a file in a format for light directions.
+    """Return lamp positions (F, 3) float64 from a file in any format for light directions.
 
-    Raises InputError as read_light_directions does for directions from the origin, and for rows
-    that name their images.
+    Raises InputError as read_light_directions does, treating positions as directions from the
+    origin, and for rows that name their images.
     """
     path = Path(path)
     table = format_of(path).read(path, n_images, "positions")
@@ -171,7 +173,7 @@ def read_light_positions(
             f"found the name {table.names[0]!r}, expected x y z",
             table.path,
             line=table.rows[0].line,
-            hint="Positions have a line for each image, in the order of the images",
+            hint="A file of positions has one line for each image, in the order of the images",
         )
     return positions
 
@@ -184,7 +186,7 @@ def lights_of(
     *,
     leave_bad: bool = False,
 ) -> tuple[Float64Array, Float64Array]:
-    """Return vectors (F, 3) of any length in the usual frame, and the same vectors at unit length.
+    """Return the table's vectors (F, 3) in the usual frame, unscaled and scaled to unit length.
 
     See unit_directions for the errors.
     """
@@ -214,12 +216,12 @@ def lights_of(
     )
 
 
-_ENOUGH_ABOVE = 6  # with as many lights above the image plane, lights below it are ignored
-_LOWEST_Z = 1e-6  # for a light above the plane; less if 90 degrees were rounded
+_ENOUGH_ABOVE = 6  # if this many lights are above the image plane, lights below it are ignored
+_LOWEST_Z = 1e-6  # of a light above the plane; smaller values are rounding errors of 90 degrees
 
 
 def above_plane(directions: Float64Array) -> Bools:
-    """Return a boolean array (F,), true for unit directions (F, 3) above the image plane."""
+    """Return which of the unit directions (F, 3) are above the image plane, as booleans (F,)."""
     return np.asarray(directions[:, 2] > _LOWEST_Z)
 
 
@@ -238,9 +240,9 @@ def unit_directions(
 
     Args:
         places: a description of each vector's place on its line.
-        lamps: whether the vectors are positions of lamps, for messages.
-        leave_bad: whether to return zero vectors and lights below the horizon as they are, for the
-            caller to drop, if enough other lights remain.
+        lamps: whether messages should call the vectors lamp positions.
+        leave_bad: whether to return zero vectors and lights below the horizon for the caller to
+            drop, instead of raising an error, if enough other lights remain.
     """
     largest = np.abs(vectors).max(axis=1, keepdims=True)
     # Dividing by the largest component first keeps all squares within float64's range.
@@ -259,9 +261,9 @@ def unit_directions(
             )
         if z <= 0:
             found = "lamp behind the object" if lamps else "light below the horizon"
-            hint = "z points to the camera; the file may be in another frame"
+            hint = "z points towards the camera; the file may use another frame"
             if (directions[:, 2] < 0).all():
-                hint = "z points away from the camera in this file: add --light-frame z-away"
+                hint = "z points away from the camera in this file, so add --light-frame z-away"
             raise InputError(
                 f"found a {found}{place} (z = {vector[2]:g}), expected z > 0",
                 path,
@@ -274,8 +276,8 @@ def unit_directions(
 def read_light_intensities(path: StrPath, n_images: int) -> Float64Array:
     """Return light intensities (F, 3) float64 in RGB order from a text file, N x 3 or 3 x N.
 
-    A single number for each light applies to all three channels. Raises InputError as
-    read_light_directions does, and with the line for an unusable intensity.
+    If there is one number per light, it applies to all three channels. Raises InputError as
+    read_light_directions does, and with the line for an intensity outside the valid range.
     """
     table = _drop_count_line(
         numbers.read_number_rows(Path(path), expected=_FILE.format("r g b")), n_images
@@ -295,12 +297,12 @@ def read_light_intensities(path: StrPath, n_images: int) -> Float64Array:
 
 
 def _sort_by_count(table: NumberRows, n_columns: int, n_images: int | None) -> NumberRows:
-    """Return the table sorted by a first column that numbers the lights, and without this
-    column.
+    """Return the table sorted by its first column, without this column, if it numbers the
+    lights.
     """
     rows = table.rows
     fits = {len(row.numbers) for row in rows} == {n_columns + 1} and n_images in (None, len(rows))
-    in_columns = n_images is None and len(rows) == n_columns  # one light in each
+    in_columns = n_images is None and len(rows) == n_columns  # each column is a light
     if not fits or in_columns or light_rows.counts_rows([row.numbers[0] for row in rows]) is None:
         return table
     ordered = sorted(rows, key=lambda row: row.numbers[0])
@@ -314,7 +316,8 @@ def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
         return table
     without, count = replace(table, rows=tuple(following)), first.numbers[0]
     if all(len(row.numbers) == 1 for row in following):
-        # In a single column, the first number is a count only if the rest then fits.
+        # In a single column, the first number is a count only if it matches the number of rows
+        # below.
         return without if len(following) == count == n_images else table
     if count in (len(following), len(following[0].numbers)):
         return without
@@ -334,9 +337,9 @@ def _drop_count_line(table: NumberRows, n_images: int | None) -> NumberRows:
 def _one_light_a_row(
     table: NumberRows, names: dict[int, str], meaning: str, n_images: int | None
 ) -> tuple[Float64Array, bool]:
-    """Return the numbers with one light in each row, and whether they had to be transposed.
+    """Return the numbers with one light per row, and whether they had to be transposed.
 
-    `names` contains the possible number of values for a light, each with its meaning.
+    `names` maps each possible number of values per light to their meaning.
     """
     values = table.as_array()
     n_columns = values.shape[1]
@@ -369,16 +372,16 @@ def _one_light_a_row(
 
 
 def rows_text(values: Float64Array) -> str:
-    """Return rows of numbers (F, C) as the lines of a light file."""
+    """Return rows of numbers (F, C) as the text of a light file."""
     return "".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in values)
 
 
 def match_images(table: NumberRows, images: Sequence[Path]) -> tuple[tuple[Path, ...], str]:
-    """Return the image for each row, and how they were matched: "name", "name without suffix" or
-    "order".
+    """Return the image of each row, and how the images were matched: "name", "name without suffix"
+    or "order".
 
-    Images without a row are left out, unless they are matched by order. Raises InputError if two
-    rows have the same name, or if neither the names nor the number of images match.
+    Images without a row are left out. Raises InputError if two rows have the same name, or if
+    neither the names nor the number of images match.
     """
     names = table.names or ()
     seen = set()
@@ -402,19 +405,21 @@ def match_images(table: NumberRows, images: Sequence[Path]) -> tuple[tuple[Path,
         f' "{names[missing]}"',
         table.path,
         line=table.rows[missing].line,
-        hint="Correct the names in the file, or use as many images as lights, in the same order",
+        hint="Correct the names in the file, or provide as many images as lights, in the same"
+        " order",
     )
 
 
 def read_lights(
     path: Path, n_images: int, frame: LightFrame = USUAL_FRAME, form: RowForm = "xyz"
 ) -> tuple[NumberRows, Float64Array]:
-    """Return the rows of any light file, which may name their images, and their directions (F, 3).
+    """Return the rows of a light file, which may name their images, and the light directions (F,
+    3).
 
-    For a folder of images, the lights are read from the image names. The frame of an AliceVision
-    file is relative to its own, which has y down and z away. Lights below the horizon are returned
-    unchanged if enough other lights remain. Raises InputError; see read_light_directions and
-    match_images.
+    If the path is a folder of images, the lights are read from the image names. For AliceVision
+    files, whose own frame has y down and z away, `frame` is applied on top of that frame. Lights
+    below the horizon are returned unchanged if enough other lights remain. Raises InputError; see
+    read_light_directions and match_images.
     """
     read = read_names if is_folder(path) else format_of(path).read
     table = read(path, n_images, form)
@@ -423,22 +428,22 @@ def read_lights(
 
 
 def light_encoder(path: Path) -> Callable[[Float64Array, Sequence[Path]], bytes]:
-    """Return the encoder for the format of a file's suffix. Raises UsageError if it can only be
-    read.
+    """Return the encoder for the format of a file's suffix. Raises UsageError if the format can
+    only be read.
     """
     encode = format_of(path).encode
     if encode is None:
         suffixes = (each.suffixes[0] for each in FORMATS if each.encode and each.suffixes)
         *most, last = ".txt", *suffixes
         raise UsageError(
-            f"{path}: light files of the type {path.suffix.lower()} can be read but not written",
+            f"{path}: {path.suffix.lower()} light files can be read but not written",
             hint=f"Write {', '.join(most)} or {last}",
         )
     return encode
 
 
 def encode_lights(path: Path, directions: Float64Array, images: Sequence[Path]) -> bytes:
-    """Return the content of a light file with the directions (F, 3) of images. See
+    """Return the content of a light file with the light directions (F, 3) of images; see
     light_encoder.
     """
     return light_encoder(path)(directions, images)

@@ -1,9 +1,9 @@
-"""Readers of light files that are not lines of numbers: RTI's .lp, AliceVision's JSON, Relight's
-.dome, other JSON, and matrices of NumPy, MATLAB and OpenCV.
+"""Readers of light files other than lines of numbers: RTI's .lp, AliceVision's JSON, Relight's
+.dome, other JSON, and matrices from NumPy, MATLAB and OpenCV.
 
-A reader takes the path, the number of images if it is known, and the meaning of a row. It returns
-rows of numbers, which may name their images, and raises InputError for a file that it cannot read.
-In a file with several matrices, the lights are the only N x 3 or 3 x N matrix that fits the images.
+A reader takes the path, the number of images if known, and the meaning of a row. It returns rows of
+numbers, which may name their images, and raises InputError if it cannot read the file. In a file
+with several matrices, the lights are the only N x 3 or 3 x N matrix that fits the number of images.
 """
 
 import json
@@ -32,9 +32,9 @@ from splinecli.system.files import parse_json
 
 
 def read_lp(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
-    """Read RTI's format: the number of lights, then one line `file name x y z` for each.
+    """Read RTI's format: the number of lights, followed by one line `file name x y z` for each.
 
-    Names may contain spaces. The number may be missing, because some programs leave it out.
+    Names may contain spaces. The number of lights is optional, because some programs omit it.
     """
     stored = numbers.read_lines(path, else_latin_1=True)
     content = [(line, text.strip()) for line, text in enumerate(stored, start=1) if text.strip()]
@@ -76,9 +76,9 @@ def read_json_lights(path: Path, n_images: int | None, form: RowForm) -> NumberR
     try:
         document = parse_json("\n".join(numbers.read_lines(path)))
     except json.JSONDecodeError as error:
-        raise InputError(f"is not JSON ({error.msg})", path, line=error.lineno) from None
+        raise InputError(f"the file is not JSON ({error.msg})", path, line=error.lineno) from None
     except ValueError as error:
-        raise InputError(f"cannot be read as JSON ({error})", path) from None
+        raise InputError(f"the file cannot be read as JSON ({error})", path) from None
     named = isinstance(document, dict) and not {"directions", *_DOME_POSITIONS}.isdisjoint(document)
     if named or path.suffix.lower() == ".dome":
         return _read_dome(document, path, form)
@@ -131,11 +131,11 @@ _DOME_POSITIONS = ("positions3d", "positionsSphere", "positions")
 
 
 def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
-    """Read a dome of Relight: lights in the order of the images, with x (right), y (up) and z
-    (camera).
+    """Read a dome of Relight: lights in the order of the images, with x right, y up and z to the
+    camera.
 
-    Positions are interpreted as lamp positions. Intensities are derived from ledAdjust, the factors
-    by which Relight multiplies the images.
+    Its positions are lamp positions. Intensities are derived from ledAdjust, the factors by which
+    Relight multiplies the images.
     """
     if not isinstance(document, dict):
         raise InputError("found no JSON object, expected a dome written by Relight", path)
@@ -151,7 +151,7 @@ def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
     vectors = _vectors(document[key])
     factors = _vectors(document.get("ledAdjust"), "rgb") or []
     if vectors is None or any(len(vector) != 3 for vector in vectors):
-        raise InputError(f'the list "{key}" does not contain x, y and z for each light', path)
+        raise InputError(f'the list "{key}" does not give x, y and z for each light', path)
     usable = all(usable_intensities(np.array(light)).all() for light in factors)
     if factors and not (usable and len(factors) == len(vectors)):
         problem = f'the list "ledAdjust" has {len(factors)} factors for {len(vectors)} lights'
@@ -162,12 +162,12 @@ def _read_dome(document: Any, path: Path, form: RowForm) -> NumberRows:
 
 
 def _listed(document: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | None:
-    """Return the names and vectors in [[x, y, z], ...], a list of objects, or a mapping from image
-    names.
+    """Return the names and vectors in a list [[x, y, z], ...], a list of objects, or a mapping from
+    image names.
     """
     if isinstance(document, dict):
         lists = [values for values in document.values() if _vectors(values) or _objects(values)]
-        # Lights without names are AliceVision's, in its own frame.
+        # Lights without names are in AliceVision's format, which has its own frame.
         if len(lists) == 1 and (_vectors(lists[0]) or "lights" not in document):
             (document,) = lists
         elif len(lists) == 1 and (objects := _objects(lists[0])) and objects[0] is not None:
@@ -182,7 +182,7 @@ def _listed(document: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] |
 def _objects(values: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | None:
     """Return the names and vectors in a list such as [{"file": "a.png", "light_dir": [x, y, z]}].
 
-    None for anything else.
+    Return None for anything else.
     """
     if isinstance(values, dict) and all(isinstance(each, dict) for each in values.values()):
         values = [{"file": name, **each} for name, each in values.items()]
@@ -200,10 +200,10 @@ def _objects(values: Any) -> tuple[tuple[str, ...] | None, list[list[float]]] | 
 
 
 def _light_of(values: dict[str, Any]) -> list[float] | None:
-    """Return the vector of an object; None if it is ambiguous or missing.
+    """Return the light vector in an object, or None if it is ambiguous or missing.
 
-    It is the only vector, or else the only one named as a light or direction, or else x, y and z,
-    or azimuth and elevation.
+    It is the only vector, or else the only one whose name contains light or direction, or else x, y
+    and z, or azimuth and elevation.
     """
     found = {key: read[0] for key, value in values.items() if (read := _vectors([value]))}
     vectors = {key: vector for key, vector in found.items() if len(vector) == 3}
@@ -222,7 +222,7 @@ def _light_of(values: dict[str, Any]) -> list[float] | None:
 def _vectors(values: Any, keys: Sequence[str] = "xyz") -> list[list[float]] | None:
     """Return lists of at least two numbers, or objects with these keys, as lists of numbers.
 
-    None for anything else.
+    Return None for anything else.
     """
     vectors = []
     for each in values if isinstance(values, list) else []:
@@ -241,14 +241,14 @@ def _unnumbered(
     names: Sequence[str] | None,
     intensities: Sequence[Sequence[float]],
 ) -> NumberRows:
-    """Return vectors from a file without line numbers as rows."""
+    """Return vectors as rows without line numbers."""
     rows = tuple(NumberRow(tuple(vector), None) for vector in vectors)
     given = np.array(intensities, np.float64) if intensities else None
     return NumberRows(path, rows, None if names is None else tuple(names), given, are_vectors=True)
 
 
-# OpenCV's FileStorage. Its own reader, in C++, was made for trusted files. No part of a pattern may
-# match the start of the next one, because backtracking would take minutes for a file of 1 MB.
+# OpenCV's FileStorage, whose own C++ reader was made for trusted files. No part of a pattern may
+# match the start of the next part, because backtracking would take minutes for a file of 1 MB.
 _YAML = re.compile(
     r"^[ \t]*([\w.-]+):\s*!!opencv-matrix\s+rows:\s*(\d{1,9})\s+cols:\s*(\d{1,9})\s+dt:\s*\"?\w+\"?"
     r"\s+data:\s*\[([^][:]*)\]",
@@ -260,16 +260,16 @@ _XML = re.compile(
 )
 
 
-NEAR_PS = frozenset({"S", "Dir"})  # positions and axes of lamps in a light.mat of near_ps
-_MOST_NAMED = 6  # matrices in a message
-# Names of the lights among several matrices, the most likely first
+NEAR_PS = frozenset({"S", "Dir"})  # lamp positions and axes in a light.mat of near_ps
+_MOST_NAMED = 6  # most matrices that a message lists
+# Usual names of the matrix of lights, the most likely first
 _LIGHT_NAMES = ("light_directions", "lightdirs", "light_dirs", "lights", "light", "l", "s")
 
 
 def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
-    """Return the rows of the light matrix in a file of NumPy, MATLAB or OpenCV, numbered from 1."""
+    """Return the rows of the light matrix in a NumPy, MATLAB or OpenCV file."""
     suffix = path.suffix.lower()
-    if suffix != ".mat":  # from which only the matrix is read
+    if suffix != ".mat":  # of a .mat file, only the matrix is read
         numbers.check_text_length(path, numbers.MOST_TEXT)
     if suffix == ".npy":
         array = _read_npy(path)
@@ -293,7 +293,7 @@ def read_matrix(path: Path, n_images: int | None, form: RowForm) -> NumberRows:
 def _choose(
     shapes: Mapping[str, tuple[int, ...]], path: Path, n_images: int | None, form: RowForm
 ) -> str:
-    """Return the name of the N x 3 or 3 x N matrix; if there are several, the one that fits the
+    """Return the name of the only N x 3 or 3 x N matrix, or of the one that fits the number of
     images.
     """
     lights = {name: shape for name, shape in shapes.items() if len(shape) == 2 and 3 in shape}
@@ -316,7 +316,7 @@ def _choose(
         f"found {'several matrices' if lights else 'no matrix'} N x 3 or 3 x"
         f" N{f': {named}{more}' if sizes else ''}",
         path,
-        hint="Write the light directions into a text file, with one line x y z for each image",
+        hint="Write the light directions to a text file, with one line x y z for each image",
     )
 
 
@@ -326,14 +326,14 @@ def _read_npy(path: Path) -> NDArray[np.generic]:
             return np.lib.format.read_array(file, allow_pickle=False)
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror})", path) from None
-    except Exception:  # the header is a Python literal: a damaged one fails in a dozen ways
+    except Exception:  # parsing a damaged header raises a dozen types of errors
         raise InputError(
-            "the .npy file is damaged, or contains no array of numbers", path
+            "the .npy file is damaged or does not contain an array of numbers", path
         ) from None
 
 
 def _read_opencv(path: Path) -> dict[str, Float64Array]:
-    """Return the matrices of a file of OpenCV's FileStorage by name. Raises InputError."""
+    """Return the matrices in a file of OpenCV's FileStorage, by name. Raises InputError."""
     text = numbers.read_text(path).decode(errors="replace")
     found: dict[str, Float64Array] = {}
     pattern = _XML if path.suffix.lower() == ".xml" else _YAML
@@ -343,7 +343,8 @@ def _read_opencv(path: Path) -> dict[str, Float64Array]:
             found[name] = values.reshape(int(rows), int(columns))
         except ValueError:
             raise InputError(
-                f"the matrix {name} is damaged: its numbers do not fill {rows} x {columns}",
+                f"the matrix {name} is damaged, because it does not contain {rows} x {columns}"
+                " numbers",
                 path,
             ) from None
     return found

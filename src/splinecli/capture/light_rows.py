@@ -1,4 +1,4 @@
-"""Rows of light files: vectors and angles, and their frames."""
+"""Rows of light files, which contain vectors or angles, and their frames."""
 
 from __future__ import annotations
 
@@ -29,42 +29,46 @@ AXIS_WORDS = {
     "z-camera": (2, 1),
     "z-away": (2, -1),
 }
-"""The words of --light-frame, each with an axis of the file and its sign in the usual frame."""
+"""The words of --light-frame, each with its axis in the file and the axis's sign in the usual
+frame.
+"""
 
 _LEAST, _MOST = 1e-12, 1e12
 INTENSITY_RANGE = f"from {_LEAST:g} to {_MOST:g}"
-"""The range of light intensities, within which numbers and their inverses fit into float32."""
+"""The range of light intensities. Within it, numbers and their inverses fit into float32."""
 
-EXCHANGED = "swap-xy"  # the word for files whose first column is y and whose second is x
+EXCHANGED = "swap-xy"  # the word for files whose first column is y and whose second column is x
 
 
 @dataclass(frozen=True)
 class LightFrame:
     """The frame of a light file."""
 
-    # of x, y and z: 1 for right, up and to the camera; -1 for left, down and away
+    # of x, y and z: 1 for right, up and towards the camera; -1 for left, down and away
     signs: tuple[int, int, int] = (1, 1, 1)
-    # whether y comes before x in the file. The signs apply to x and y in either order
+    # whether y precedes x in the file. The signs apply to x and y in either case
     exchanged: bool = False
-    # position of the file's origin, for positions of lamps
+    # position of the file's origin, for lamp positions
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def matrix(self) -> Float64Array:
-        """The matrix M (3, 3) for which directions @ M' are in the usual frame."""
+        """The matrix M (3, 3) such that directions @ M' are in the usual frame."""
         order = [1, 0, 2] if self.exchanged else [0, 1, 2]
         return np.diag(self.signs).astype(np.float64)[:, order]
 
     def __str__(self) -> str:
-        """Return the value of --light-frame, such as "x-left,y-down", without axes in their usual
-        direction.
+        """Return the value of --light-frame, such as "x-left,y-down", which omits axes in their
+        usual direction.
         """
         words = [EXCHANGED] if self.exchanged else []
         words += [word for word, (axis, sign) in AXIS_WORDS.items() if sign == self.signs[axis] < 0]
         return ",".join(words) or "x-right,y-up"
 
     def describe(self) -> str:
-        """Return words such as "x and y exchanged, y negated"; empty for the usual frame."""
+        """Return a description such as "x and y exchanged, y negated"; empty for the usual
+        frame.
+        """
         parts = ["x and y exchanged"] if self.exchanged else []
         if negated := [axis for axis, sign in zip("xyz", self.signs, strict=True) if sign < 0]:
             parts.append(f"{' and '.join(negated)} negated")
@@ -83,11 +87,12 @@ BOTH_NEGATED = LightFrame((-1, -1, 1))
 PLANE_FRAMES = tuple(
     LightFrame((x, y, 1), exchanged) for exchanged, x, y in product((False, True), (1, -1), (1, -1))
 )
-"""The eight frames with z to the camera, starting with the usual one."""
+"""The eight frames in which z points to the camera, starting with the usual one."""
 
 
 def parse_light_frame(text: str | None) -> LightFrame:
-    """Return the frame for a list such as "x-left,y-down,swap-xy"; the usual frame for None.
+    """Return the frame described by a list such as "x-left,y-down,swap-xy"; None is the usual
+    frame.
 
     Axes that are not listed keep their usual direction. Raises UsageError for an unknown word or a
     repeated axis.
@@ -109,15 +114,16 @@ def parse_light_frame(text: str | None) -> LightFrame:
         if axis in signs:
             raise UsageError(
                 f"--light-frame is {text!r}, where {'xyz'[axis]} is listed twice",
-                hint="Leave one out",
+                hint="Remove one of them",
             )
         signs[axis] = sign
     return LightFrame((signs.get(0, 1), signs.get(1, 1), signs.get(2, 1)), exchanged)
 
 
 LightForm = Literal["xyz", "azel", "slant-tilt"]
-"""The numbers that define a light: a vector; azimuth and elevation; or slant and tilt (HALCON).
-Angles are in degrees."""
+"""The numbers that define a light: a vector, azimuth and elevation, or slant and tilt (HALCON).
+Angles are in degrees.
+"""
 
 RowForm = LightForm | Literal["positions"]  # the numbers in a row of a light file
 
@@ -127,16 +133,17 @@ COLUMNS: dict[RowForm, dict[int, str]] = {
     "slant-tilt": {2: "slant tilt"},
     "positions": {3: "x y z"},
 }
-"""The number of columns of each form, and their meaning."""
+"""The number of columns of each form and their meaning."""
 
 AZEL_HINT = "If they are azimuth and elevation in degrees, add --light-format azel"
 
 
 def directions_from_angles(angles_deg: Float64Array, form: RowForm) -> Float64Array:
-    """Return unit vectors (F, 3) from azimuth and elevation, or slant and tilt (F, 2), in degrees.
+    """Return unit vectors (F, 3) from azimuth and elevation, or from slant and tilt (F, 2), in
+    degrees.
 
-    Azimuth and tilt are measured from x (right) towards y (up), the elevation from the image plane
-    towards the camera, and the slant from the camera axis.
+    Azimuth and tilt are measured from x (right) towards y (up), elevation from the image plane
+    towards the camera, and slant from the camera axis.
     """
     azimuth, elevation = np.radians(
         [_azimuth_elevation(row, form) for row in angles_deg.tolist()]
@@ -158,20 +165,20 @@ def check_angles(table: NumberRows, form: RowForm) -> None:
         if not (0 < elevation <= 90 and abs(azimuth) <= 360):
             if form == "slant-tilt":
                 problem = (
-                    f"found slant {first:g} and tilt {second:g}, expected 0 to below 90 and -360"
-                    " to 360 degrees"
+                    f"found slant {first:g} and tilt {second:g}, expected slants from 0 to below 90"
+                    " and tilts from -360 to 360 degrees"
                 )
                 hint = "The slant is measured from the camera axis"
             else:
                 problem = (
-                    f"found azimuth {first:g} and elevation {second:g}, expected -360 to 360 and"
-                    " above 0 to 90 degrees"
+                    f"found azimuth {first:g} and elevation {second:g}, expected azimuths from -360"
+                    " to 360 and elevations from above 0 to 90 degrees"
                 )
-                hint = "The elevation is measured from the image plane, so 90 is towards the camera"
+                hint = "Elevation is measured from the image plane, so 90 points towards the camera"
             raise InputError(problem, table.path, line=row.line, hint=hint)
     if np.abs([row.numbers[-2:] for row in table.rows]).max() < 2 * np.pi:
         raise InputError(
-            "no angle is above 2 pi, so they look like radians, expected degrees",
+            "found no angle above 2 pi, which suggests radians, expected degrees",
             table.path,
             line=table.rows[0].line,
             hint="Multiply them by 180 / pi = 57.2958",
@@ -179,7 +186,7 @@ def check_angles(table: NumberRows, form: RowForm) -> None:
 
 
 def zenith_as_elevation(light_directions: Float64Array) -> Float64Array:
-    """Return lights (..., 3) as if their angle from the camera axis had been read as the
+    """Return lights (..., 3) as they would be if their angle from the camera axis had been read as
     elevation.
     """
     level = np.linalg.norm(light_directions[..., :2], axis=-1, keepdims=True)
@@ -188,8 +195,8 @@ def zenith_as_elevation(light_directions: Float64Array) -> Float64Array:
 
 
 def lights_of_half_vectors(half_vectors: Float64Array) -> Float64Array:
-    """Return the directions (..., 3) of lights that mirrors with these unit normals reflect to the
-    camera.
+    """Return the directions (..., 3) of lights that mirrors with these unit normals reflect towards
+    the camera.
     """
     return 2 * half_vectors[..., 2:] * half_vectors - (0.0, 0.0, 1.0)
 
@@ -197,7 +204,7 @@ def lights_of_half_vectors(half_vectors: Float64Array) -> Float64Array:
 def refuse_angles(table: NumberRows) -> None:
     """Raise InputError for rows that clearly contain angles.
 
-    They have two columns, or a third one that numbers them or contains the same radius for all.
+    Such rows have two columns, or a third column that numbers them or repeats the same radius.
     """
     rows = [row.numbers for row in table.rows]
     lengths = {len(row) for row in rows}
@@ -211,21 +218,21 @@ def refuse_angles(table: NumberRows) -> None:
             " columns (x y z)"
         )
     elif lengths == {3} and not numbered:
-        # Lights from all sides would include vectors with y < 0.
+        # Vectors of lights from all sides would include some with y < 0.
         azimuth, elevation, radius = np.array(rows).T
         in_range = (np.abs(azimuth) <= 360).all() and ((elevation > 0) & (elevation <= 90)).all()
         if np.ptp(radius) == 0 and in_range and elevation.max() > 2 and np.abs(azimuth).max() > 90:
             found, hint = (
                 f"azimuth, elevation and {radius[0]:g}, expected x y z",
-                f"Leave the third column out. {hint}",
+                f"Remove the third column. {hint}",
             )
     if found:
         raise InputError(f"found {found}", table.path, line=table.rows[0].line, hint=hint)
 
 
 def counts_rows(column: list[float]) -> int | None:
-    """Return 0 or 1 if a column numbers the rows from there, in any order; None for any other
-    column.
+    """Return the first number, 0 or 1, if a column numbers the rows in any order, or None for any
+    other column.
     """
     first = min(column)
     counts = first in (0, 1) and sorted(column) == [first + place for place in range(len(column))]
@@ -238,18 +245,18 @@ _AXES, _ANGLES, _SLANTS = ("x", "y", "z"), ("az", "el"), ("slant", "tilt")
 
 
 def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
-    """Return the rows of a text file, without "#" comments, blank lines and a header.
+    """Return the rows of a text file without "#" comments, blank lines or a header.
 
-    A header is a first row without numbers. If it names the columns, as in "z y x" or "elevation
-    azimuth", they are reordered. Rows that begin with a word belong to named images: in "img 1.png
-    0 0 1", the last numbers are the light.
+    A first row without numbers is a header. If it names the columns, as in "z y x" or "elevation
+    azimuth", they are reordered. Rows that begin with a word name their image: in "img 1.png 0 0
+    1", the last three numbers are the light.
 
     Args:
-        n_numbers: how many numbers follow a name.
+        n_numbers: the number of values that follow a name.
 
     Raises:
         InputError: with the line, for a word that is not a finite number; also for a file without
-            rows, and for a header or rows that clearly contain unexpected angles.
+            rows, and if the header or rows clearly contain angles although vectors are expected.
     """
     rows = read_rows_of_words(path, n_numbers, expected=expected)
     order = list(range(n_numbers))
@@ -265,7 +272,7 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
                 line=line,
                 hint="The elevation is 90 minus the angle from the camera axis",
             )
-    # A count may precede rows with names.
+    # Rows with names may be preceded by a count.
     body = rows[1:] if len(rows) > 1 and len(rows[0][2]) == 1 else rows
     if body and all(to_number(words[0]) is None for *_, words in body):
         if all(len(words) > n_numbers for *_, words in body):
@@ -288,7 +295,7 @@ def read_light_rows(path: Path, *, expected: str, n_numbers: int) -> NumberRows:
 def _order_of(header: list[str]) -> list[int]:
     """Return the positions of x, y and z, azimuth and elevation, or slant and tilt in a header.
 
-    For any other header, return the usual order.
+    Return the usual order for any other header.
     """
     words = [word.lower().strip("\"'") for word in header]
     for pattern, wanted in (
@@ -315,7 +322,7 @@ def _reordered(table: NumberRows, order: list[int]) -> NumberRows:
 
 
 def image_name(text: str, numbers: list[str]) -> str:
-    """Return the image name in a row that ends with numbers, without folders, quotes and
+    """Return the image name in a row that ends with numbers, without folders, quotes or
     separators.
     """
     for word in reversed(numbers):
@@ -324,5 +331,5 @@ def image_name(text: str, numbers: list[str]) -> str:
 
 
 def usable_intensities(values: Float64Array) -> Bools:
-    """Return a boolean array, true for values within INTENSITY_RANGE."""
+    """Return which values are within INTENSITY_RANGE, as booleans of the same shape."""
     return (values >= _LEAST) & (values <= _MOST)

@@ -1,5 +1,5 @@
-"""Find the lights of a capture: in light files with usual names, in nearby folders, and in the
-names of the images.
+"""Find the lights of a capture in light files with usual names, in nearby folders, and in image
+names.
 """
 
 import re
@@ -33,23 +33,23 @@ _SUFFIXES = {".txt", *(suffix for each in FORMATS for suffix in each.suffixes)}
 _OTHER_FILES = re.compile("intens|camera|filenames|lobes|position|calibration|normal")
 _LIGHTS = r"(.*[^a-z])?light(s|ing)?[^a-z]*(dirs?|directions?|vec(tor)?s?|sources?|matrix)?[^a-z]*"
 _LIGHT_FOLDER = re.compile(rf"{_LIGHTS}|lamps?|leds?|lp")
-_MOST_FILES = 50  # largest number of files that are tried in a folder
+_MOST_FILES = 50  # most files that are tried per folder
 
 
 class NoLightsError(InputError):
-    """No lights of a capture were found."""
+    """No lights were found for a capture."""
 
 
 def light_names() -> str:
-    """Return the names under which light files are found, for messages."""
+    """Return the names by which light files are found, for messages."""
     names = [name for each in FORMATS for name in each.found]
     return f"{', '.join(names)} or {LIGHT_POSITIONS[0]}"
 
 
 def find_light_file(folder: Path) -> Path | None:
-    """Return the light file with a usual name in the folder; None if there is none.
+    """Return the light file with a usual name in the folder, or None.
 
-    Raises InputError for several files of the same rank above 0.
+    Raises InputError if there are several files of the same rank above 0.
     """
     for rank, group in groupby(_usual(folder), lambda found: found[0]):
         paths = [path for _, path in group if is_found_file(path)]
@@ -65,7 +65,9 @@ def find_light_file(folder: Path) -> Path | None:
 
 
 def _usual(folder: Path) -> Iterator[tuple[int, Path]]:
-    """Yield the entries with usual names of light files and their ranks, in order of precedence."""
+    """Yield the ranks and paths of entries with usual names of light files, in order of
+    precedence.
+    """
     entries = list_folder(folder)
     for rank in sorted({each.rank for each in FORMATS}):
         for name in (name for each in FORMATS if each.rank == rank for name in each.found):
@@ -75,12 +77,12 @@ def _usual(folder: Path) -> Iterator[tuple[int, Path]]:
 def search_lights(
     folder: Path, images: Sequence[Path]
 ) -> tuple[Path | None, tuple[CaptureWarning, ...]]:
-    """Return the lights of a capture without a usual light file, and a warning that names them.
+    """Return the source of lights for a capture without a usual light file, and a warning that
+    names it.
 
-    A light file that fits the images is searched for in the folder, in a folder called Lights
-    inside it or next to it, and in the parent folder. If the names of the images contain lights,
-    their folder is returned. None if nothing is found. Raises InputError if several files fit and
-    differ.
+    The folder, a folder called Lights inside it or next to it, and the parent folder are searched
+    for a light file that fits the images. If the image names contain lights, their folder is
+    returned. Return None if nothing is found. Raises InputError if several files fit but differ.
     """
     stored, of_images = page_of(images[0])[0], images[0].parent
     if stored.suffix.lower() == ".mat" and _fit(stored, images) is not None:
@@ -97,7 +99,7 @@ def search_lights(
                 hint="Choose one with --lights FILE",
             )
         return path, _found(path)
-    for path in _candidates(folder):  # with any name, if they name the images
+    for path in _candidates(folder):  # files of any name, if they name the images
         if _fit(path, images, named=True) is not None:
             return path, _found(path)
     if (named := lights_in_names(images)) is not None:
@@ -106,12 +108,12 @@ def search_lights(
 
 
 def _found(source: object) -> tuple[CaptureWarning, ...]:
-    text = f"The light directions were read from {source}. To use others, pass --lights FILE."
+    text = f"The light directions were read from {source}. To use other lights, pass --lights FILE."
     return (CaptureWarning(LIGHTS_FOUND, text),)
 
 
 def _places(folder: Path, of_images: Path) -> Iterator[list[Path]]:
-    """Yield the possible light files of each place, the nearest place first."""
+    """Yield the candidate light files of each place, starting with the nearest place."""
     near = dict.fromkeys((folder, of_images))
     yield [path for each in near for path in _likely(each)]
     above = folder.absolute().parent
@@ -125,27 +127,25 @@ def _places(folder: Path, of_images: Path) -> Iterator[list[Path]]:
 
 
 def light_folders(folder: Path) -> list[Path]:
-    """Return the subfolders called Lights or similarly that contain no images."""
+    """Return the subfolders called Lights or similar that contain no images."""
     named = [each for each in list_folder(folder) if _LIGHT_FOLDER.fullmatch(each.name.lower())]
     return [each for each in named if is_folder(each) and not list_images(each)]
 
 
 def has_lights(folder: Path) -> bool:
-    """Return whether a folder contains files or folders with typical names of lights."""
+    """Return whether a folder contains files or folders whose names are typical of lights."""
     return bool(_likely(folder) or light_folders(folder))
 
 
 def _likely(folder: Path) -> list[Path]:
-    """Return the files in a folder that have typical names of light files."""
+    """Return the files in a folder whose names are typical of light files."""
     usual = {path for _, path in _usual(folder)}
     files = _candidates(folder)
     return [p for p in files if p in usual or re.fullmatch(_LIGHTS, p.stem.lower())]
 
 
 def _candidates(folder: Path) -> list[Path]:
-    """Return the files in a folder with the suffix of a light file, except files with another
-    role.
-    """
+    """Return the files in a folder that have the suffix of a light file but no other role."""
     files = [
         path
         for path in list_folder(folder)
@@ -164,19 +164,19 @@ def _fit(
     by_order: bool = False,
     named: bool = False,
 ) -> Float64Array | None:
-    """Return the lights (F, 3) of a file in the order of the images; None if they do not match.
+    """Return the lights (F, 3) of a file in the order of the images, or None if they do not match.
 
-    Images without a light have NaN.
+    Images without a light get NaN.
 
     Args:
         by_order: whether the file may name other images.
         named: whether the file must name its images.
     """
-    longest = min(numbers.MOST_TEXT, 20_000 + 500 * len(images))  # longer files take seconds
+    longest = min(numbers.MOST_TEXT, 20_000 + 500 * len(images))  # longer files take too long
     with suppress(InputError, OSError):
         if path.suffix.lower() != ".mat" and path.stat().st_size > longest:
             return None
-        for count in (len(images), 3 * len(images)):  # each channel may have a light
+        for count in (len(images), 3 * len(images)):  # each channel may have its own light
             with suppress(InputError):
                 table, directions = read_lights(path, count, form=form)
                 if table.names is None:
@@ -191,10 +191,11 @@ def _fit(
 
 
 def light_option(folder: Path, images: Sequence[Path]) -> str | None:
-    """Return the options for reading a file as lights: any in the folder or beside the images, or
-    one with a name of lights in another place. None if no file fits.
+    """Return the options for reading a file as lights, or None if no file fits.
 
-    Raises InputError with the reason if a file of the capture with a name of lights does not fit.
+    Any file in the folder or next to the images is tried; in other places, only files whose names
+    are typical of lights. Raises InputError with the reason if such a file in the capture's folder
+    does not fit.
     """
     near = dict.fromkeys((folder, images[0].parent))
     named, *others = _places(folder, images[0].parent)

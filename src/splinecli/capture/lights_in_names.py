@@ -1,7 +1,7 @@
-"""Light directions in the names of images: angles as in the Yale Face Database B, x and y, or sides
-such as left and top.
+"""Light directions from image names: angles as in the Yale Face Database B, x and y, or sides such
+as left and top.
 
-The folder of the images is used as a light file whose rows name their images.
+The folder of the images is treated as a light file whose rows name their images.
 """
 
 import math
@@ -19,14 +19,14 @@ from splinecli.maths import Float64Array
 from splinecli.maths.robust import MIN_LIGHTS
 
 _NUMBER = r"[-+]?\d+(?:\.\d+)?"
-_LEAST_SHARE = 0.8  # smallest share of the images with a light in their names
+_LEAST_SHARE = 0.8  # smallest share of images whose names must contain a light
 _ELEVATION_OF_SIDES_DEG = 45.0
 
 Rows = dict[Path, tuple[float, float, float]]
 
 
 def _numbers(pattern: str, images: Sequence[Path]) -> tuple[list[Path], Float64Array]:
-    """Return the images whose stems match a pattern, and the numbers in its groups (F, N)."""
+    """Return the images whose stems match a pattern, and the numbers (F, N) in its groups."""
     found = [(image, match) for image in images if (match := re.search(pattern, image.stem, re.I))]
     numbers = [list(map(float, match.groups())) for _, match in found]
     return [image for image, _ in found], np.array(numbers, np.float64)
@@ -67,7 +67,7 @@ def _xy(images: Sequence[Path]) -> tuple[Rows, str]:
     for count in (3, 2):
         pattern = start + between.join(count * [f"({_NUMBER})"]) + r"\)?$"
         found, vectors = _numbers(pattern, images)
-        if not found or not (vectors[:, :2].min(axis=0) < 0).all():  # for example counters
+        if not found or not (vectors[:, :2].min(axis=0) < 0).all():  # counters, for example
             continue
         if count == 3:
             return _rows(found, vectors), "x, y and z"
@@ -94,8 +94,8 @@ _SIDE = re.compile(rf"(?<![a-z])((?:(?:{'|'.join(_SIDE_OF)})[ _-]?)+)(?![a-z])")
 
 
 def _sides(images: Sequence[Path]) -> tuple[Rows, str]:
-    """Read left, right, top, bottom and front, or two of them, in names that are otherwise
-    equal.
+    """Read left, right, top, bottom and front, or two of them, in names that are equal
+    otherwise.
     """
     rows, rests = Rows(), set[str]()
     for image in images:
@@ -111,8 +111,8 @@ def _sides(images: Sequence[Path]) -> tuple[Rows, str]:
     if len(rests) > 1 or len(set(rows.values())) < len(rows):
         return {}, ""
     text = (
-        f"sides, at an assumed elevation of {_ELEVATION_OF_SIDES_DEG:.0f} degrees; other elevations"
-        " make the surface steeper or flatter"
+        f"sides, at an assumed elevation of {_ELEVATION_OF_SIDES_DEG:.0f} degrees; if the lamps"
+        " were higher or lower, the surface is too steep or too flat"
     )
     return rows, text
 
@@ -121,10 +121,11 @@ _READERS: tuple[Callable[[Sequence[Path]], tuple[Rows, str]], ...] = (_yale, _an
 
 
 def lights_in_names(images: Sequence[Path]) -> tuple[Rows, str] | None:
-    """Return the lights in the names of images, and a description of these names.
+    """Return the lights in image names and a description of these names, or None if too few names
+    contain a light.
 
-    None if too few names contain a light. Frame: x right, y up, z to the camera. Vectors have any
-    length, and may point behind the image plane.
+    Frame: x right, y up, z to the camera. Vectors may have any length and may point behind the
+    image plane.
     """
     for read in _READERS:
         rows, text = read(images)

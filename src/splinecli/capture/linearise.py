@@ -1,6 +1,7 @@
-"""Observations from images: decode, take the window and the mask, invert the transfer curve,
-subtract ambient light, divide by the falloff and by the light's intensity. The last step is shared
-by files and arrays."""
+"""Compute observations from images: decode them, take the window and the mask, invert the transfer
+curve, subtract ambient light, and divide by the falloff and the light's intensity. Files and arrays
+share the last step.
+"""
 
 from __future__ import annotations
 
@@ -28,27 +29,27 @@ Numbers = TypeVar("Numbers", bound=np.generic)
 
 @dataclass(frozen=True)
 class Window:
-    """The pixels of the images that are read. Images are subsampled without averaging, so stored
-    values are kept.
+    """The part of the images that is read. Images are subsampled without averaging, which preserves
+    the stored values.
     """
 
     # left, top, width and height in pixels; None for whole images
     box: tuple[int, int, int, int] | None = None
-    step: int = 1  # one of so many rows and columns is read
-    shape: tuple[int, ...] | None = None  # (H, W) of the whole images, if only a part is read
+    step: int = 1  # every step-th row and column is read
+    shape: tuple[int, ...] | None = None  # (H, W) of the whole images if only a part is read
 
     @property
     def is_whole(self) -> bool:
         return self.box is None and self.step == 1
 
     def in_words(self) -> str | None:
-        """Return a description of the window for messages; None for whole images."""
+        """Return a description of the window for messages, or None for whole images."""
         words = [] if self.box is None else ["{2} x {3} pixels from ({0}, {1})".format(*self.box)]
-        words += [f"one of {self.step} rows and columns"] if self.step > 1 else []
+        words += [f"one in {self.step} rows and columns"] if self.step > 1 else []
         return ", ".join(words) or None
 
     def of(self, pixels: NDArray[Numbers]) -> NDArray[Numbers]:
-        """Return the window of an image or map (H, W, ...), as a view."""
+        """Return the window of an image or map (H, W, ...) as a view."""
         left, top, width, height = self.box or (0, 0, pixels.shape[1], pixels.shape[0])
         return pixels[top : top + height : self.step, left : left + width : self.step]
 
@@ -65,8 +66,8 @@ class Window:
         return np.asarray(to_window @ matrix, np.float64)
 
     def filled(self, mask: Bools) -> Bools:
-        """Return the mask of whole images from a mask of the window. Each pixel represents its
-        skipped neighbours.
+        """Return the mask of whole images from a mask of the window. Skipped pixels take the value
+        of the pixel that represents them.
         """
         whole = np.zeros(mask.shape if self.shape is None else self.shape, np.bool_)
         part = replace(self, step=1).of(whole)
@@ -74,8 +75,8 @@ class Window:
         return whole
 
     def on(self, image: ImageHeader) -> Window:
-        """Return the window on images of the size of this one. Raises InputError if the box is not
-        inside.
+        """Return the window for images of the same size as this one. Raises InputError if the box
+        extends beyond the image.
         """
         if self.is_whole:
             return self
@@ -84,7 +85,7 @@ class Window:
             left, top, box_width, box_height = self.box
             if left + box_width > width or top + box_height > height:
                 crop = ",".join(map(str, self.box))
-                problem = f"--crop {crop} is not inside the image of {width} x {height} pixels"
+                problem = f"--crop {crop} extends beyond the image of {width} x {height} pixels"
                 raise InputError(problem, path=image.path)
         return replace(self, shape=shape)
 
@@ -100,33 +101,33 @@ def parse_window(crop: str | None, scale: str | None) -> Window:
         box = tuple(int(number) for number in found[0].split(",")) if found else ()
         if not box or not box[2] or not box[3]:
             problem = (
-                f"--crop is {crop!r}; expected X,Y,W,H: the upper left corner and the size in"
+                f"--crop is {crop!r}, expected X,Y,W,H, the upper left corner and the size in"
                 " pixels"
             )
-            raise UsageError(problem, hint="Such as --crop 1000,500,800,600")
+            raise UsageError(problem, hint="For example, --crop 1000,500,800,600")
     found = re.fullmatch(r"1(?:/(\d{1,3}))?", "1" if scale is None else scale.replace(" ", ""))
     step = int(found[1] or 1) if found else 0
     if not step:
-        raise UsageError(f"--scale is {scale!r}; expected 1/N, such as 1/4")
+        raise UsageError(f"--scale is {scale!r}, expected 1/N, such as 1/4")
     return Window(box, step)
 
 
 @dataclass(frozen=True)
 class RadiometricCalibration:
-    """How stored values become linear light."""
+    """Settings for converting stored values to linear light."""
 
     curve: TransferCurve = 1.0  # the images' transfer curve
-    # an image under ambient light alone, which is subtracted from all others
+    # an image taken under ambient light alone, which is subtracted from all others
     ambient: Path | None = None
-    # images of a uniform white surface, one for each light or one for all. Images are divided by
-    # them
+    # images of a uniform white surface by which the images are divided, one for each light or one
+    # for all
     flat_field: tuple[Path, ...] = ()
-    automatic: bool = False  # whether the curve that all images state is used instead of `curve`
+    automatic: bool = False  # whether a curve stated by all images replaces `curve`
 
     def with_stated_curve(
         self, images: Sequence[ImageHeader]
     ) -> tuple[RadiometricCalibration, list[CaptureWarning]]:
-        """Return this calibration with the curve that all images state, if it is automatic, and
+        """Return this calibration, if it is automatic with the curve that all images state, and
         warnings.
         """
         if self.curve != 1:
@@ -134,16 +135,15 @@ class RadiometricCalibration:
         by = ", ".join(sorted({image.curve.by for image in images if image.curve.curve != 1}))
         if not self.automatic:
             text = (
-                f"The image files are marked as display-encoded ({by}), but are read as linear, as"
-                " --transfer requests."
+                f"The image files are marked as display-encoded ({by}) but are read as linear, as"
+                " requested by --transfer."
             )
-            text += " Leave it out if their values are not linear."
+            text += " Omit the option if their values are not linear."
             return self, [CaptureWarning(codes.DISPLAY_ENCODED, text)] if by else []
         unread, warnings = [image.path.name for image in images if image.curve.unread], []
         if unread:
             text = (
-                f"The colour profile of {unread[0]} has no curve that can be read, so it does not"
-                " count."
+                f"The colour profile of {unread[0]} was ignored, because its curve cannot be read."
             )
             warnings.append(
                 CaptureWarning(
@@ -153,11 +153,11 @@ class RadiometricCalibration:
         curve, *others = {image.curve.curve for image in images}
         if others:
             text = (
-                f"The images look display-encoded ({by}) but are read as linear. Add --transfer"
-                " srgb if they are sRGB."
+                f"The images seem to be display-encoded ({by}) but are read as linear. Add"
+                " --transfer srgb if they are in sRGB."
             )
             return self, [*warnings, CaptureWarning(codes.DISPLAY_ENCODED, text)]
-        if curve not in (1, BT709):  # a video has no other curve
+        if curve not in (1, BT709):  # videos always have this curve
             how = (
                 "the profile says"
                 if isinstance(curve, tuple)
@@ -171,7 +171,7 @@ class RadiometricCalibration:
         return replace(self, curve=curve), warnings
 
 
-# stored values are linear light, unless all images state a curve
+# treats stored values as linear light unless all images state a curve
 AUTOMATIC = RadiometricCalibration(automatic=True)
 AS_STORED = RadiometricCalibration()  # stored values are linear light
 EVERY_PIXEL = slice(None)
@@ -180,10 +180,10 @@ EVERY_PIXEL = slice(None)
 def linear_light(stored: Array, path: Path, curve: TransferCurve = 1.0) -> Float32Array:
     """Return stored values of any shape as linear light. Raises InputError as to_linear does.
 
-    Linear 8-bit values may have been rounded, or truncated as `image >> 8` does, and the file does
+    Linear 8-bit values may have been rounded, or truncated as by `image >> 8`, and the file does
     not record which. A value v then represents light between v - 0.5 and v + 0.5, or between v and
-    v + 1. Adding a quarter of a step halves the error in both cases; in dark pixels, this error
-    changes the normals.
+    v + 1. Adding a quarter of a step halves the error in both cases. In dark pixels, this error
+    affects the normals.
     """
     linear = decode_transfer(to_linear(stored, path), curve)
     if stored.dtype == np.uint8 and curve == 1:
@@ -191,13 +191,13 @@ def linear_light(stored: Array, path: Path, curve: TransferCurve = 1.0) -> Float
     return linear
 
 
-# From some of the read pixels to their linear light (p, C)
+# From a selection of the pixels read to their linear light (p, C)
 LightOf = Callable[[Integers | slice], Float32Array]
-_BLOCK = 1 << 15  # pixels whose values stay in a processor's cache
+_BLOCK = 1 << 15  # as many pixels as fit into a processor's cache
 
 
 def take_pixels(image: Array, mask: Bools) -> Array:
-    """Return image[mask], the pixels (P, C) of an image (H, W, C) in a mask (H, W), but faster."""
+    """Return the pixels (P, C) of an image (H, W, C) in a mask (H, W), faster than image[mask]."""
     if not mask.any():
         return image[:0, 0]
     if mask.all():
@@ -208,8 +208,8 @@ def take_pixels(image: Array, mask: Bools) -> Array:
 
 
 def take_around(image: Array, around: Bools) -> Array:
-    """Return the pixels (R, C) around the object. Invalid values, such as NaN, become 0, so every
-    pixel is kept.
+    """Return the pixels (R, C) around the object. Invalid values such as NaN become 0, so that no
+    pixel is lost.
     """
     pixels = take_pixels(image, around)
     if pixels.dtype.kind == "f":
@@ -225,13 +225,15 @@ def pixel_reader(
     wanted: Integers | slice = EVERY_PIXEL,
     around: Bools | None = None,
 ) -> Callable[[Path, int], tuple[Array, int, LightOf]]:
-    """Return a function from an image and its index to the pixels (P, C) of a mask (H, W): as
-    stored, and the number and the linear light of others, the `wanted` pixels, or all pixels
-    followed by the pixels of the mask `around` (H, W).
+    """Return a function that reads the pixels of a mask (H, W) from an image, given its path and
+    index.
 
-    The ambient image and a common flat field are read now, once; of several, each image has its
-    own. Both functions raise InputError for an unreadable image. Messages name `like` as the image
-    of the expected size.
+    The function returns the stored pixels (P, C), and the number and linear light of the `wanted`
+    pixels or, with a mask `around` (H, W), of all pixels followed by the pixels in `around`.
+
+    The ambient image and a common flat field are read immediately and only once; if there are
+    several flat fields, each is read together with its image. Both functions raise InputError for
+    an unreadable image. Messages name `like` as the image whose size is expected.
     """
     flats = radiometry.flat_field
     ambient: Float32Array | None = None
@@ -239,7 +241,7 @@ def pixel_reader(
     def pixels(
         path: Path, like: str = "the other images", wanted: Integers | slice = EVERY_PIXEL
     ) -> tuple[Array, int, LightOf]:
-        """Return the pixels as stored, and linear without ambient light."""
+        """Return the stored pixels, and their number and linear light without ambient light."""
         image = decode_image(path, ExpectedSize(window.shape or mask.shape, like))
         image = window.of(image)
         stored = take_pixels(image, mask)
@@ -259,7 +261,7 @@ def pixel_reader(
         mean = linear[: len(stored)].mean()
         if mean <= 0:
             raise InputError("the flat-field image is black", path=path)
-        # darker places do not show the falloff
+        # darker pixels are not reliable
         return np.asarray(np.maximum(linear / mean, 0.02), np.float32)
 
     if radiometry.ambient is not None:
@@ -280,13 +282,13 @@ def pixel_reader(
 class StoredPixels:
     """The mask's pixels of one image."""
 
-    path: Path  # the image; messages name it
+    path: Path  # of the image, for messages
     values: Array  # (P, C), as stored
-    # count, light: of the p pixels whose linear light was requested; see pixel_reader
+    # the number p and the linear light of the pixels for which it was requested; see pixel_reader
     count: int
     light: LightOf
-    intensity: Float64Array  # (3,), RGB, of the light
-    stated_white_level: int | None = None  # the white level that the file states, or None
+    intensity: Float64Array  # (3,) RGB intensity of the light
+    stated_white_level: int | None = None  # the white level stated in the file, or None
 
     @property
     def linear(self) -> Float32Array:
@@ -294,10 +296,10 @@ class StoredPixels:
         return self.light(EVERY_PIXEL)
 
     def observe(self) -> Float32Array:
-        """Return observations (p,): each channel is divided by its intensity, then the mean is
-        taken.
+        """Return observations (p,), the mean over the channels after dividing each by its
+        intensity.
 
-        A gray image is equal in all channels.
+        A gray image is treated as having three equal channels.
         """
         weights = 1 / (3 * self.intensity)
         if self.values.shape[1] == 1:
@@ -308,14 +310,14 @@ class StoredPixels:
         return found
 
     def find_saturated(self, white_level: float | None) -> ImageValues:
-        """Return the image statistics that decide which pixels are saturated, from look_at. Raises
-        InputError.
+        """Return the image statistics that determine which pixels are saturated; see look_at.
+        Raises InputError.
         """
         return look_at(self.values, self.path, given=white_level, stated=self.stated_white_level)
 
     def colours(self) -> Float32Array:
-        """Return linear RGB (p, 3), each channel divided by its intensity; lamps do not tint gray
-        images.
+        """Return linear RGB (p, 3), each channel divided by its intensity. Gray images stay
+        gray.
         """
         if self.values.shape[1] == 1:
             return np.repeat(self.observe()[:, None], 3, axis=1)

@@ -1,5 +1,5 @@
-"""Lamps at arm's length as point lights, the size of a pixel in the unit of their positions, and
-checks that the positions are plausible.
+"""Nearby lamps, modelled as point lights above an image of known scale, and checks that their
+positions are plausible.
 
 The frame is the same as for light directions: x right, y up, z to the camera. The origin is on the
 object's mean plane, at the centre of the image. Positions may be in any unit, such as millimetres.
@@ -31,20 +31,20 @@ class NearLamps:
     """
 
     positions: Float64Array  # (F, 3), in any unit, in front of the object's mean plane (z > 0)
-    # the width of a pixel on the object's mean plane, in the unit of the positions
+    # width of a pixel on the object's mean plane, in the unit of the positions
     pixel_size: float
-    # row and column of the origin, in pixels of the window that was read
+    # row and column of the origin, in pixels of the window
     middle: tuple[float, float]
-    # (F,), the distances along the lamps' axes at which the light intensities are valid. See `of`
+    # (F,), the distances along the lamps' axes at which the light intensities are valid; see `of`
     reference_distances: Float64Array
     # (3, 3) in pixels, as in OpenCV. None assumes an orthographic camera
     camera_matrix: Float64Array | None = None
     # (P, 3), the surface points at the pixels, in the unit of the positions; None if unknown
     points: Float32Array | None = None
     # (F, 4), the axis of each lamp, a unit vector towards the object, and its exponent mu. At an
-    # angle a to the axis, the intensity is cos(a)^mu, as in the model of an LED (Quéau et al.,
-    # LED-based photometric stereo, JMIV 2018, section 2.1). None for lamps that emit equally in
-    # all directions
+    # angle a from the axis, the intensity is cos(a)^mu, as in the LED model (Quéau et al.,
+    # LED-based photometric stereo, JMIV 2018, section 2.1). None for lamps that emit equally in all
+    # directions
     lobes: Float64Array | None = None
 
     def __post_init__(self) -> None:
@@ -67,12 +67,12 @@ class NearLamps:
         camera_matrix: Float64Array | None = None,
         lobes: Float64Array | None = None,
     ) -> NearLamps:
-        """Return lamps at positions (F, 3) above whole images of this shape (H, W).
+        """Return lamps at positions (F, 3) above whole images of shape (H, W).
 
         Args:
-            equal: whether the light intensities are unknown, so that all lamps are assumed to be
+            equal: whether the light intensities are unknown; all lamps are then assumed to be
                 equally bright along their axes. Otherwise, the intensities are valid at the origin,
-                where a gray card would be measured.
+                as if measured with a gray card there.
         """
         distances = np.linalg.norm(positions, axis=1)
         if equal:
@@ -86,8 +86,8 @@ class NearLamps:
     def within(
         self, left: float, top: float, step: int, camera_matrix: Float64Array | None
     ) -> NearLamps:
-        """Return the lamps for a window of the image that starts at (left, top) and has every
-        step-th pixel.
+        """Return the lamps for a window that starts at (left, top) and contains every step-th
+        pixel.
 
         The camera matrix is in pixels of the window.
         """
@@ -97,7 +97,9 @@ class NearLamps:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the distances from the origin, scale, camera and lobes as JSON values."""
+        """Return the distances from the origin, the scale, the camera and the lobes as JSON
+        values.
+        """
         return {
             "distances": np.linalg.norm(self.positions, axis=1).round(4).tolist(),
             "pixel_size": self.pixel_size,
@@ -123,7 +125,7 @@ class NearLamps:
         )
 
     def choose_pixels(self, rows: slice | Integers) -> NearLamps:
-        """Return the lamps with the surface points of a selection of the pixels."""
+        """Return the lamps with the surface points of a selection of pixels."""
         return self if self.points is None else replace(self, points=self.points[rows])
 
     def plane_points(self, rows: NDArray[np.number], columns: NDArray[np.number]) -> Float64Array:
@@ -142,10 +144,10 @@ class NearLamps:
         return (width, height), self.plane_points(rows.mean()[None], columns.mean()[None])[0]
 
     def angles_across_deg(self, mask: Bools) -> Float64Array:
-        """Return by how much the direction of each lamp (F,) changes across the object, in degrees.
+        """Return the change (F,) of each lamp's direction across the object, in degrees.
 
-        This is the largest angle between the direction at the centre of the mask's bounding box and
-        at its corners, all on the object's mean plane.
+        This is the largest angle between the directions at the centre and at a corner of the mask's
+        bounding box, on the object's mean plane.
         """
         rows, columns = bounds(mask)
         row, column = np.meshgrid([*rows, rows.mean()], [*columns, columns.mean()])
@@ -168,42 +170,40 @@ class NearLamps:
 
 
 def within_lobes(lobes: Float64Array, towards: Floats) -> Float32Array:
-    """Return the intensities (P, F) of lamps relative to their axes, at points in unit directions
-    (P, F, 3) to the lamps.
+    """Return the intensities (P, F) of lamps relative to those on their axes, from unit directions
+    (P, F, 3) towards the lamps.
     """
     cosines = np.einsum("pfc,fc->pf", towards, -lobes[:, :3])
-    # Dividing observations by the lobe amplifies noise, so small values are clipped. A pixel
-    # outside the lobe then looks shadowed.
+    # Dividing observations by the lobe amplifies noise, so small values are clipped. Pixels outside
+    # the lobe then appear shadowed.
     return np.asarray(cosines.clip(min=0) ** lobes[:, 3], np.float32).clip(min=0.05)
 
 
 UNIT_HINT = (
-    "Use one unit, such as millimetres, for all lengths: the lamps' positions or distance, and the"
-    " pixel size or object width"
+    "Use the same unit, such as millimetres, for all lengths: the lamp positions or distance, and"
+    " the pixel size or object width"
 )
 
 
 def check_distances(lamps: NearLamps, mask: Bools, positions: Path | None) -> list[CaptureWarning]:
-    """Return warnings about implausible distances between the lamps and an object with this mask
-    (H, W).
+    """Return warnings about implausible distances between the lamps and an object with mask (H, W).
 
-    The file of positions is named in errors. Raises InputError if a lamp would be inside the
-    object.
+    Errors name the file of positions. Raises InputError if a lamp would be inside the object.
     """
     sizes, middle = lamps.extent(mask)
     distances = np.linalg.norm(lamps.positions - middle, axis=1)
     nearest = int(distances.argmin())
     text = (
-        f"lamp {nearest + 1} is {distances[nearest]:.3g} from the middle of the object, which is"
-        f" {sizes[0]:.3g} wide"
+        f"lamp {nearest + 1} is {distances[nearest]:.3g} away from the centre of the object, which"
+        f" is {sizes[0]:.3g} wide"
     )
     if distances[nearest] < 0.5 * min(sizes):
-        raise InputError(f"{text}, so it would be inside", positions, hint=UNIT_HINT)
+        raise InputError(f"{text}, so it would be inside the object", positions, hint=UNIT_HINT)
     if distances[nearest] < max(sizes):
         problem = "A lamp is very near"
     # Confusing metres with millimetres changes the distance by a factor of 1000.
     elif distances[nearest] > 300.0 * max(sizes):
-        problem = "The lamps are so far away that their light is parallel"
+        problem = "The lamps are so far away that their light is practically parallel"
     else:
         return []
     return [CaptureWarning(LAMP_DISTANCE, f"{problem}: {text}. {UNIT_HINT}.")]
@@ -214,9 +214,9 @@ def distant_lights(
 ) -> list[CaptureWarning]:
     """Return a warning if lights are treated as distant although a file contains their positions.
 
-    `lamps` are the lamps of this file; None if their scale is unknown. The mask is (H, W).
+    `lamps` are the lamps in this file, or None if their scale is unknown. The mask is (H, W).
     """
-    name = "the lamps' positions" if positions is None else positions.name
+    name = "the lamp positions" if positions is None else positions.name
     if lamps is None:
         text = (
             f"{name} is not used, because the size of a pixel is unknown. Add --pixel-size or"
@@ -227,7 +227,7 @@ def distant_lights(
         return []
     text = (
         f"The lights are treated as distant, but the lamps are near: according to {name}, a light"
-        f" direction changes by up to {angle_deg:.0f} degrees between the middle and the edge of"
+        f" direction changes by up to {angle_deg:.0f} degrees between the centre and the edge of"
         " the object. Use --light-positions instead of --lights."
     )
     return [CaptureWarning(NEAR_LAMPS, text)]

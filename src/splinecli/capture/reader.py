@@ -52,24 +52,24 @@ from splinecli.records import capture_warnings as codes
 from splinecli.records.capture_warnings import CaptureWarning
 from splinecli.system.files import StrPath
 
-EQUAL = "equal"  # given instead of a file of intensities: all lights have the same intensity
+EQUAL = "equal"  # instead of a file of intensities, states that all lights have the same intensity
 
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureOptions:
-    """How a capture is read. Files that are named here are used instead of those in the folder.
+    """Options for reading a capture. Files named here take precedence over files in the folder.
 
     intensities: a file, or EQUAL.
-    radiometry: how stored values become linear light. Where it names no ambient image, one called
-        `ambient` in the folder is subtracted.
-    white_level: stored value from which an observation is considered saturated, such as 4095 for 12
-        bits. By default it is found from the files and their values (see WhiteLevel).
-    light_format: whether the rows of a light file of text are vectors or angles.
-    lamps: positions of near lamps, and the camera, unless files in the folder give them.
+    radiometry: how stored values are converted to linear light. If it has no ambient image, an
+        image called `ambient` in the folder is subtracted.
+    white_level: stored value from which observations are considered saturated, such as 4095 for 12
+        bits. By default, it is determined from the files and their values (see WhiteLevel).
+    light_format: whether the rows of a text light file are vectors or angles.
+    lamps: positions of near lamps, and the camera, if they are not in files in the folder.
     needs_lights: whether light files are read. Without them, the lights have to be estimated.
     lights_in_channels: whether the channels of each image are observations under three lights; see
         ChannelLights.
-    crosstalk: a file with their crosstalk, instead of that in the folder.
+    crosstalk: a file with the crosstalk of these channels.
     """
 
     lights: StrPath | None = None
@@ -88,18 +88,18 @@ class CaptureOptions:
 
     @property
     def are_equal(self) -> bool:
-        """Whether all lights are said to have the same intensity."""
+        """Whether the user states that all lights have the same intensity."""
         return self.intensities is not None and str(self.intensities) == EQUAL
 
 
 def open_capture(folder: StrPath, options: CaptureOptions = CaptureOptions()) -> CaptureSource:
-    """Return a capture whose files are found and whose lights are read.
+    """Return the capture in a folder with its files located and its lights read.
 
     Raises:
-        InputError: find_capture_files does not recognise the folder, a light file is wrong, or the
-            window is not inside the images.
-        UsageError: the white level is not a number above 0, or the object's width is given and a
-            part is read.
+        InputError: find_capture_files does not recognise the folder, a light file is invalid, or
+            the window extends beyond the images.
+        UsageError: the white level is not a number above 0, or the object's width is given although
+            only a part of the images is read.
 
     Examples:
         >>> from splinecli.capture import open_capture
@@ -127,7 +127,7 @@ def open_capture(folder: StrPath, options: CaptureOptions = CaptureOptions()) ->
     files, directions, intensities, warnings = _read_all_lights(files, options, form, channels)
     warnings += (*files.warnings, *of_reference)
     radiometry = _with_flat_fields(radiometry, in_folder, files.images)
-    if reference:  # divided by it, the flat surface is equally bright in all channels
+    if reference:  # dividing by it makes the flat surface equally bright in all channels
         intensities = np.broadcast_to(1 / directions[:, 2:], directions.shape).copy()
     if of_near_ps is not None:
         intensities = of_near_ps
@@ -148,7 +148,7 @@ def open_capture(folder: StrPath, options: CaptureOptions = CaptureOptions()) ->
     warnings += _left_out(files)
     radiometry, of_curve = radiometry.with_stated_curve(facts)
     warnings += of_curve
-    # Earlier versions read such images as linear, or those with a colour profile as sRGB.
+    # Earlier versions read such images as linear or, with a colour profile, as sRGB.
     is_decoded = radiometry.automatic and radiometry.curve != 1
     decoded = (radiometry.curve or "sRGB",) if is_decoded else ()
     warnings += _turned_by_viewers(facts)
@@ -168,7 +168,7 @@ def open_capture(folder: StrPath, options: CaptureOptions = CaptureOptions()) ->
         camera_matrix=camera_matrix,
         channels=channels,
         window=options.window.on(facts[0]),
-        # Omitted if they are not given, so that earlier stamps stay valid.
+        # Values that are not given are omitted, so that stamps of earlier versions stay valid.
         stamp=(*stamp, *decoded, *given_level),
     )
 
@@ -179,7 +179,7 @@ def _with_near_ps(
     near: lamp_files.LampFiles | None,
     camera_matrix: Float64Array | None,
 ) -> tuple[CaptureOptions, Float64Array | None]:
-    """Return the options with the frame of the lamps if their file is one of near_ps, and their
+    """Return the options, with the frame of the lamps if their file is in near_ps format, and their
     light intensities. Raises InputError.
     """
     path = None if near is None or not near.used else near.positions
@@ -193,13 +193,13 @@ def _with_near_ps(
 def _with_flat_fields(
     radiometry: linearise.RadiometricCalibration, in_folder: Sequence[Path], images: Sequence[Path]
 ) -> linearise.RadiometricCalibration:
-    """Return the calibration with a flat field for each image, if it has several. Raises
-    InputError.
+    """Return the calibration with its flat fields, if there are several, assigned to the images.
+    Raises InputError.
     """
     flats = radiometry.flat_field  # in the order of the folder's images
     if len(flats) < 2:
         return radiometry
-    each = tuple(dict.fromkeys(in_folder))  # those with three lights once
+    each = tuple(dict.fromkeys(in_folder))  # images with three lights only once
     if len(flats) != len(each):
         problem = f"found {len(flats)} flat-field images, expected 1 or {len(each)}"
         raise InputError(f"{problem}, one for each image", path=flats[0].parent)
@@ -210,14 +210,14 @@ def _with_flat_fields(
 def _find_files(
     folder: Path, options: CaptureOptions
 ) -> tuple[CaptureFiles, lamp_files.LampFiles | None, RowForm]:
-    """Return the files of a capture, its near lamps, and what the rows of its light file are."""
+    """Return the files of a capture, its near lamps, and the form of the rows in its light file."""
     intensities = None if options.are_equal else options.intensities
     given = (options.lights, intensities, options.mask, options.ground_truth)
     paths = (None if file is None else Path(file) for file in given)
     overrides = Overrides(*paths, needs_lights=options.needs_lights)
     if options.lamps.positions is not None and options.lights is not None:
         raise UsageError(
-            "--lights and --light-positions cannot be used together", hint="Leave one out"
+            "--lights and --light-positions cannot be used together", hint="Omit one of them"
         )
     form: RowForm = options.light_format
     near = None
@@ -226,17 +226,17 @@ def _find_files(
     if near is not None and near.used and near.positions is not None:
         if form != "xyz":
             problem = (
-                f"--light-format {form} concerns light directions, but {near.positions} has"
+                f"--light-format {form} applies to light directions, but {near.positions} contains"
                 " positions"
             )
-            hint = "Leave it out, or use --light-distance with a file of directions"
+            hint = "Omit it, or use --light-distance with a file of directions"
             raise UsageError(problem, hint=hint)
         overrides, form = replace(overrides, lights=near.positions), "positions"
     has_width = near is not None and near.options.object_width is not None
     if has_width and options.window.box is not None:
         raise UsageError(
-            "--object-width needs the whole object in the image",
-            hint="Give --pixel-size beside --crop",
+            "--object-width requires the whole object to be in the image",
+            hint="With --crop, use --pixel-size instead",
         )
     files = find_capture_files(folder, overrides)
     found = find_ambient(files.folder, files.images)
@@ -247,7 +247,9 @@ def _find_files(
 def _find_channels(
     files: CaptureFiles, options: CaptureOptions
 ) -> tuple[ChannelLights | None, str | None]:
-    """Return how channels become images of their own, and the stamp of their crosstalk."""
+    """Return the mapping from channels to observations, if it is used, and the stamp of the
+    crosstalk file.
+    """
     if not options.lights_in_channels:
         return None, None
     file = find_named(files.folder, (CROSSTALK,))
@@ -259,11 +261,11 @@ def _find_channels(
 def _find_reference(
     files: CaptureFiles, options: CaptureOptions, form: RowForm
 ) -> tuple[CaptureFiles, tuple[Path, ...], list[CaptureWarning]]:
-    """Return the files without the picture of a sensor without contact, this picture if it is used
-    as the flat field, and a warning.
+    """Return the files without a sensor's reference picture, this picture if it serves as the flat
+    field, and a warning.
 
-    It is looked for if the light file has three lights for each image but one. Raises InputError if
-    it is unclear which image it is.
+    The reference was taken without contact. It is searched for if the light file has three lights
+    for every image except one. Raises InputError if it is ambiguous.
     """
     path, images, given = files.light_directions, files.images, options.radiometry.flat_field
     if not options.lights_in_channels or path is None or len(images) < 2:
@@ -280,25 +282,27 @@ def _find_reference(
     found = find_reference(images)
     if found is None:
         raise InputError(
-            f"found {len(images)} images ({short_list(images)}), but lights for"
-            f" {len(images) - 1} in {path.name}, three for each",
+            f"found {len(images)} images ({short_list(images)}), but"
+            f" {path.name} has three lights each for {len(images) - 1}",
             files.folder,
-            hint="Move the image without contact into a folder of its own, and give it with"
+            hint="Move the image without contact to a separate folder, and pass it with"
             " --flat-field DIR",
         )
     files = replace(files, images=tuple(image for image in images if image != found))
     has_own = find_named(files.folder, (CROSSTALK,)) is not None or options.crosstalk is not None
     if given or has_own or files.light_intensities is not None or options.intensities is not None:
         return replace(files, others=(*files.others, found)), (), []
-    text = f"{found.name} is used as the flat field: it shows the sensor without contact."
-    note = CaptureWarning(codes.FLAT_FIELD_CHOICE, f"{text} Give --flat-field DIR for another one.")
+    text = f"{found.name} was used as the flat field, because it shows the sensor without contact."
+    note = CaptureWarning(
+        codes.FLAT_FIELD_CHOICE, f"{text} To use another one, pass --flat-field DIR."
+    )
     return files, (found,), [note]
 
 
 def _read_all_lights(
     files: CaptureFiles, options: CaptureOptions, form: RowForm, channels: ChannelLights | None
 ) -> tuple[CaptureFiles, Float64Array, Float64Array | None, list[CaptureWarning]]:
-    """Return the result of _read_lights, with an error of its own for lights in channels."""
+    """Return the result of _read_lights, with adapted errors for lights in channels."""
     try:
         return _read_lights(files, options.light_frame, form)
     except WrongCountError as error:
@@ -311,8 +315,8 @@ def _read_all_lights(
         )
         if error.n_found == CHANNELS:
             hint = (
-                "Give each image under these three lamps a folder of its own, with the one without"
-                " contact if there is one"
+                "Put each image under these three lamps into a separate folder, together with the"
+                " image without contact if there is one"
             )
         raise InputError(problem, path=error.path, hint=hint) from None
 
@@ -322,8 +326,8 @@ def _left_out(files: CaptureFiles) -> list[CaptureWarning]:
         return []
     more = f" and {len(files.others) - 1} more" if len(files.others) > 1 else ""
     text = (
-        f"{files.others[0].name}{more}: left out, because the name is not that of a photograph"
-        " under one of the lights. To use it as one, list all images in filenames.txt."
+        f"{files.others[0].name}{more}: left out, because the name suggests that it is not a"
+        " photograph under one of the lights. To include it, list all images in filenames.txt."
     )
     return [CaptureWarning(codes.IMAGES_LEFT_OUT, text)]
 
@@ -333,8 +337,8 @@ def _turned_by_viewers(facts: Sequence[ImageHeader]) -> list[CaptureWarning]:
     if orientation == UPRIGHT:
         return []
     text = (
-        f"Viewers rotate the images (EXIF orientation {orientation}), but splinecli does not: mask,"
-        " light directions and results are in the frame of the stored pixels."
+        f"Viewers rotate the images (EXIF orientation {orientation}), but splinecli does not, so"
+        " the mask, light directions and results are in the frame of the stored pixels."
     )
     return [CaptureWarning(codes.EXIF_ORIENTATION, text)]
 
@@ -387,8 +391,8 @@ def _drop_bad_lights(
     intensities: Float64Array | None,
     warnings: list[CaptureWarning],
 ) -> tuple[CaptureFiles, Float64Array, Float64Array | None, list[CaptureWarning]]:
-    """Return the arguments without lights that are zero or not above the image plane; see
-    unit_directions.
+    """Return the arguments without lights that are zero or not above the image plane (see
+    unit_directions).
     """
     good = above_plane(directions)
     if good.all():
@@ -399,14 +403,14 @@ def _drop_bad_lights(
     )
     assert files.light_directions is not None
     text = (
-        f"{bad}: left out, because its light in {files.light_directions.name} is not above the"
-        " horizon."
+        f"{bad}: left out, because its light direction in {files.light_directions.name} is not"
+        " above the horizon."
     )
     if len(first) > 1:
         text = (
             f"{bad}{', ...' if len(first) > 3 else ''}: {len(first)} of {len(good)} images were"
-            f" left out, because their lights in {files.light_directions.name} are at the image"
-            " plane or behind it. If they are not, the file is in another frame (--light-frame)."
+            f" left out, because their lights in {files.light_directions.name} are in the image"
+            " plane or behind it. If this is wrong, the file uses another frame (--light-frame)."
         )
     warnings.append(CaptureWarning(codes.IMAGES_LEFT_OUT, text))
     files = replace(
@@ -420,10 +424,10 @@ def _drop_bad_lights(
 def _match_count(
     images: tuple[Path, ...], path: Path, frame: LightFrame, form: RowForm
 ) -> tuple[tuple[Path, ...], NumberRows, Float64Array]:
-    """Return the images that a light file is for, its rows, and their directions (F, 3).
+    """Return the images that belong to a light file, its rows, and their directions (F, 3).
 
-    These are all images, or else the images of the usual size, or the images whose names differ
-    only in their numbers.
+    These are all images or, if the numbers differ, the images of the most frequent size or those
+    whose names differ only in their numbers.
     """
     try:
         return images, *read_lights(path, len(images), frame, form)
@@ -437,7 +441,7 @@ def _match_count(
             raise
         hint = f"{error.hint}"
         if error.n_found < len(images):
-            hint += f". In this order, it has none for {short_list(images[error.n_found :])}"
+            hint += f". In this order, there is no light for {short_list(images[error.n_found :])}"
         if error.n_found in (CHANNELS, CHANNELS * len(images)) and _is_colour(images):
             hint += (
                 ". If the lights are three coloured lamps that shine at once, add"
@@ -447,7 +451,9 @@ def _match_count(
 
 
 def _alike(images: tuple[Path, ...], key: Callable[[Path], object]) -> tuple[Path, ...]:
-    """Return the images with the most frequent key, or all if two keys are equally frequent."""
+    """Return the images with the most frequent key, or all images if two keys are equally
+    frequent.
+    """
     keys = [key(image) for image in images]
     (usual, count), *others = Counter(keys).most_common(2)
     if others and others[0][1] == count:
@@ -471,8 +477,8 @@ def _given_intensities(
     channels: ChannelLights | None,
     found: Float64Array | None,
 ) -> Float64Array | None:
-    """Return the intensities (F, 3) as options and files give them, or else those that are found
-    with the lights; None if there is none.
+    """Return the intensities (F, 3) given by options or files, or else the intensities found with
+    the lights, or None.
     """
     if options.are_equal:
         return None
@@ -487,14 +493,14 @@ def _read_intensities(
     in_folder: Sequence[Path],
     channels: ChannelLights | None,
 ) -> Float64Array:
-    """Return the intensities (F, 3) of images from a file with a line for each, or for each image
-    of the folder.
+    """Return the intensities (F, 3) of images from a file with one line for each of them, or for
+    each image in the folder.
     """
-    if channels is not None:  # a line r g b for each image
+    if channels is not None:  # one line r g b for each image
         of_images = read_light_intensities(path, len(images) // CHANNELS)
         return np.repeat(of_images.reshape(-1, 1), 3, axis=1)
     if len(images) < len(in_folder):
-        with suppress(InputError):  # the file is for the chosen images, or wrong in any case
+        with suppress(InputError):  # then it must have a line for each of the chosen images
             chosen = [in_folder.index(image) for image in images]
             return read_light_intensities(path, len(in_folder))[chosen]
     return read_light_intensities(path, len(images))

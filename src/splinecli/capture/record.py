@@ -1,4 +1,4 @@
-"""The capture record used by all steps after the recipe, and lights estimated from the images."""
+"""The capture record that all steps after the recipe use, and lights estimated from the images."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SIDES = (
 )
 # azimuths, counter-clockwise from the right
 SIDES_DEG = {side: 45.0 * place for place, side in enumerate(_SIDES)}
-ESTIMATE = "estimate"  # used instead of a light file: the lights are estimated from the images
+ESTIMATE = "estimate"  # passed instead of a light file to estimate the lights from the images
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class FoundLights:
 
 
 def azimuth_of(first_light: str) -> float:
-    """Return the azimuth in degrees for a number or a side of the image, such as `upper-left`.
+    """Return the azimuth in degrees from a number or a side of the image such as `upper-left`.
 
     Raises UsageError.
     """
@@ -58,7 +58,7 @@ def azimuth_of(first_light: str) -> float:
 
 
 def placeholders(n_lights: int) -> Float64Array:
-    """Return arbitrary valid directions (F, 3), to be used until the lights are estimated."""
+    """Return arbitrary valid directions (F, 3), for use until the lights are estimated."""
     azimuth = 2 * np.pi * np.arange(n_lights) / max(n_lights, 1)
     return np.stack((0.6 * np.cos(azimuth), 0.6 * np.sin(azimuth), np.full(n_lights, 0.8)), axis=1)
 
@@ -79,37 +79,36 @@ class Capture:
     Frame: x right, y up, z to the camera; light directions are unit vectors towards the light.
 
     Args:
-        observations: (P, F) float32, linear, for the mask's pixels in row-major order: the mean
-            over the channels after each was divided by its light intensity.
+        observations: (P, F) float32, linear, of the mask's pixels in row-major order: the mean over
+            the channels, each divided by its light intensity.
         light_directions: (F, 3) float64, unit, above the horizon (z > 0).
         light_indices: (F,) zero-based indices of these lights in the whole capture.
         mask: (H, W) bool with P true pixels.
         ground_truth: (H, W, 3) float32 unit normals, zero where the ground truth is unknown; or
             None.
-        warnings: faults that reduce accuracy, and choices made on behalf of the user.
+        warnings: faults that reduce accuracy, and choices made for the user.
         estimated_intensities: (F,) float64 estimated light intensities, by which the observations
-            were divided because no file contains them and the images show that they differ; else
-            None.
-        estimated_colours: (F, 3) float64 estimated colours of the lamps, by which the channels were
-            divided because they differ between images; else None.
-        restored: (P, F) bool, true where a saturated observation was replaced by an estimate; None
-            if no observation was restored.
-        white_level: the stored value from which observations are considered saturated; None for
-            floating-point images and for captures that are not read from images.
-        light_errors_deg: (F,) float64, the expected errors of light_directions if they were
-            estimated from the images; else None.
-        removed_blur: the standard deviation in pixels of the blur that was removed from the images;
-            None if no blur was removed.
-        lamps: the positions of near lamps. In this case, light_directions are valid at the origin,
-            the centre of the image on the object's mean plane. None for distant lights.
+            were divided because no file contains them and they differ between images, or None.
+        estimated_colours: (F, 3) float64 estimated lamp colours, by which the channels were divided
+            because they differ between images, or None.
+        restored: (P, F) bool, true where a saturated observation was replaced with an estimate, or
+            None if no observation was restored.
+        white_level: the stored value from which observations are considered saturated, or None for
+            floating-point images and captures that were not read from images.
+        light_errors_deg: (F,) float64, the expected errors in degrees of light_directions if they
+            were estimated from the images, or None.
+        removed_blur: the standard deviation in pixels of the blur that was removed from the images,
+            or None if none was removed.
+        lamps: the near lamps; light_directions are then valid at the origin, the centre of the
+            image on the object's mean plane. None for distant lights.
         camera_matrix: (3, 3) float64, in pixels of the mask, as in OpenCV. None assumes an
-            orthographic camera. Near lamps have their own camera matrix.
-        mended: the codes of unambiguous faults that were corrected.
+            orthographic camera. Near lamps have a separate camera matrix.
+        mended: the codes of unambiguous faults in the input that were corrected.
 
     Raises:
-        InputError: the shapes disagree, a value is not finite, a light is not a unit vector above
-            the horizon, there are fewer than three lights or all are coplanar, the mask is empty,
-            or the camera matrix is invalid.
+        InputError: the shapes do not match, a value is not finite, a light is not a unit vector
+            above the horizon, there are fewer than three lights or all are coplanar, the mask is
+            empty, or the camera matrix is invalid.
         UsageError: the camera matrix is not 3 x 3.
     """
 
@@ -131,7 +130,7 @@ class Capture:
     mended: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        # The record is frozen, so dtypes are converted here. Arrays are only copied if necessary.
+        # The record is frozen, so dtypes are converted here. Arrays are copied only if necessary.
         for dtype, names in _DTYPES.items():
             for name in names:
                 values = getattr(self, name)
@@ -156,9 +155,9 @@ class Capture:
         return len(self.observations)
 
     def choose_lights(self, positions: Sequence[int]) -> Capture:
-        """Return the same capture under some of its lights, in the order given.
+        """Return the capture under a selection of its lights, in the given order.
 
-        The positions are zero-based, among this record's lights. Raises the errors of
+        The positions are zero-based and refer to this record's lights. Raises the errors of
         check_light_indices, and InputError if the chosen lights are coplanar.
         """
         chosen = list(check_light_indices(positions, self.n_lights))
@@ -177,11 +176,11 @@ class Capture:
         )
 
     def choose_pixels(self, positions: Integers) -> Capture:
-        """Return the capture with a selection of its pixels, from ascending zero-based positions
+        """Return the capture with a selection of its pixels, given ascending zero-based positions
         (p,).
         """
         mask = np.zeros_like(self.mask)
-        # Rows of observations follow the mask's row-major order, and so do the mask's flat indices.
+        # Rows of observations are in the mask's row-major order, as are the mask's flat indices.
         mask.flat[np.flatnonzero(self.mask)[positions]] = True
         return replace(
             self,
@@ -209,10 +208,9 @@ class Capture:
             raise InputError(problem, hint="z points to the camera")
         if in_one_plane(lights):
             problem = (
-                f"{self.name}: the {count} lights are in one plane, so the normals cannot be"
-                " determined"
+                f"{self.name}: the {count} lights are coplanar, so the normals cannot be determined"
             )
-            raise InputError(problem, hint="Choose lights that surround the viewing direction")
+            raise InputError(problem, hint="Choose lights all around the viewing direction")
 
     def _check_pixels(self) -> None:
         if self.mask.ndim != 2:
@@ -276,5 +274,5 @@ def _blocks(rows: Float32Array, size: int = 1 << 20) -> Iterator[Float32Array]:
 
 
 def name_reading(*, as_stored: bool) -> str:
-    """Return the word for how a capture was read in reports and pixel sets."""
+    """Return the word that describes in reports and pixel sets how a capture was read."""
     return "as stored" if as_stored else "restored"

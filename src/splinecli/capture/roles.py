@@ -24,9 +24,7 @@ from splinecli.system.files import is_folder, is_found_file
 
 
 def copies(images: Sequence[Path]) -> list[CaptureWarning]:
-    """Return a warning that lists images left out because another file shows the same
-    photograph.
-    """
+    """Return a warning about images left out because another file shows the same photograph."""
     stored = {page_of(image)[0] for image in images}
     stems = {image.stem.lower() for image in stored}
     others = [
@@ -50,7 +48,7 @@ def copies(images: Sequence[Path]) -> list[CaptureWarning]:
 
 
 def pictures_of(role: str, folders: Sequence[Path], images: Sequence[Path]) -> list[Path]:
-    """Return pictures in these folders whose names contain a role's word and which are not
+    """Return the pictures in these folders whose names contain a role's word and that are not
     images.
     """
     entries = [path for folder in dict.fromkeys(folders) for path in list_folder(folder)]
@@ -62,10 +60,11 @@ def choose_mask(
 ) -> tuple[Path | None, tuple[CaptureWarning, ...]]:
     """Return a mask for photographs without a usual mask file, and a warning that names it.
 
-    Candidates are pictures of the photographs' size with the word "mask" in their names in the
-    folder, pictures in a folder of masks, and pictures next to the folder that have its name.
-    Without candidates, use the mask in the .mat file of the photographs, or the alpha channel of
-    the first photograph. None if there is no candidate or more than one.
+    Candidates have the size of the photographs. They are pictures in the folder with the word
+    "mask" in their names, pictures in a folder of masks, and pictures next to the folder that have
+    its name. Without candidates, use the mask in the .mat file of the photographs, or the alpha
+    channel of the first photograph. Return None for the mask if there is no candidate or more than
+    one.
     """
     named = _masks_by_name(folder, images)
     try:
@@ -73,7 +72,7 @@ def choose_mask(
         masks = [path for path in named if read_header(path).size[0][:2] == size[:2]]
         if not named and read_header(images[0]).stated_channels in (2, 4):
             masks = [images[0]] if cut_out(decode_with_alpha(images[0])[1]) is not None else []
-    except InputError:  # reported when the images are read
+    except InputError:  # raised again when the images are read
         return None, ()
     stored, _ = page_of(images[0])
     if not masks and stored.suffix.lower() == ".mat":
@@ -83,10 +82,10 @@ def choose_mask(
     if not masks:
         return None, ()
     source = f"The alpha channel of {masks[0].name}" if masks[0] in images else masks[0].name
-    text = f"{source} is used as the mask. To use another one, pass --mask FILE."
+    text = f"{source} is used as the mask. To use another mask, pass --mask FILE."
     if len(masks) > 1:
         text = (
-            "No mask is used, because several files may be the mask:"
+            "No mask is used, because several files could be the mask:"
             f" {', '.join(path.name for path in masks)}. Choose one with --mask FILE."
         )
     return masks[0] if len(masks) == 1 else None, (CaptureWarning(MASK_CHOICE, text),)
@@ -106,7 +105,7 @@ def _masks_by_name(folder: Path, images: Sequence[Path]) -> list[Path]:
 
 
 def find_ambient(folder: Path, images: Sequence[Path]) -> Path | None:
-    """Return the image without any of the lights; None if there is none.
+    """Return the image taken with all lights off, or None.
 
     It has a usual name, or is the only picture of the photographs' size with the word "ambient" in
     its name.

@@ -1,4 +1,4 @@
-"""Samples of a capture's pixels, small enough for checks that depend on neighbouring pixels."""
+"""Samples of a capture's pixels that are small enough for checks that use neighbouring pixels."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from splinecli.errors import InputError
 from splinecli.images.mask import find_object
 from splinecli.maths import Bools, Floats
 
-MAX_PIXELS = 20_000  # larger captures are subsampled by 2, 3 and so on
+MAX_PIXELS = 20_000  # larger captures are subsampled by a factor of 2, 3 and so on
 CLOSEUP_SIDE = 192  # side of a closeup in pixels
 Part = tuple[slice, slice]  # rows and columns of the images
 
@@ -25,15 +25,20 @@ class Sample:
 
 
 def grid_of(mask: Bools) -> Part:
-    """Return rows and columns of a grid with at most about MAX_PIXELS pixels of the mask (H, W)."""
+    """Return the rows and columns of a grid with at most about MAX_PIXELS pixels in a mask
+    (H, W).
+    """
     step = max(1, int(np.ceil(np.sqrt(np.count_nonzero(mask) / MAX_PIXELS))))
     return slice(None, None, step), slice(None, None, step)
 
 
 def closeup_of(mask: Bools) -> Part:
-    """Return rows and columns of a square of side CLOSEUP_SIDE at the middle of a mask (H, W)."""
+    """Return the rows and columns of a square of side CLOSEUP_SIDE in the middle of a mask
+    (H, W).
+    """
     middles = []
-    # Find the median row and column without listing the pixels, which takes 16 bytes for each.
+    # Find the median row and column without listing the pixels, which would take 16 bytes per
+    # pixel.
     for axis in (1, 0):
         up_to = np.cumsum(np.count_nonzero(mask, axis=axis))
         middles.append(int(np.searchsorted(up_to, (up_to[-1] + 1) // 2)))
@@ -52,7 +57,7 @@ def pixels_of(parts: Iterable[Part], mask: Bools) -> Bools:
 def sample_observations(
     observations: Floats, mask: Bools, part: Part | None = None, known: Bools | None = None
 ) -> Sample:
-    """Return a sample from a part of the images, or from the mask's grid by default.
+    """Return a sample from a part of the images, by default from the mask's grid.
 
     The observations (P, F) cover the mask (H, W), or only its `known` pixels, which must include
     the part.
@@ -65,7 +70,7 @@ def sample_observations(
 
 
 def leave_out_background(sample: Sample) -> tuple[Sample, float]:
-    """Return the sample without a dark background, and the share of its pixels left out.
+    """Return the sample without a dark background, and the share of its pixels that were left out.
 
     The sample is unchanged if it has a mask or no dark background.
     """

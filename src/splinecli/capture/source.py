@@ -1,5 +1,5 @@
-"""An opened capture: lights and facts of images loaded, pixels still on disk and read one image at
-a time.
+"""An opened capture, whose lights and image headers are loaded but whose pixels are still on disk,
+to be read one image at a time.
 """
 
 from __future__ import annotations
@@ -52,8 +52,7 @@ from splinecli.system.machine import count_chosen_cores, in_order
 
 Item = TypeVar("Item")
 Image = TypeVar("Image")
-# Bytes of each pixel of the mask: normals and errors (20), their maps (16), and arrays that are
-# needed for a while.
+# Bytes per pixel of the mask for normals and errors (20), their maps (16), and temporary arrays
 BYTES_OF_RESULTS = 52
 Progress = Callable[[], object]  # called once after each image
 
@@ -62,18 +61,18 @@ Progress = Callable[[], object]  # called once after each image
 class Source:
     """Images of one object and their lights; the pixels are read one image at a time.
 
-    The recipe (recipe/steps.py) turns a source into a Capture. Files and arrays each have a
-    subclass.
+    The recipe (recipe/steps.py) turns a source into a Capture. There is a subclass for files and
+    one for arrays.
     """
 
     light_directions: Float64Array  # (F, 3), unit; x right, y up, z to the camera
-    light_intensities: Float64Array  # (F, 3), RGB; ones if they are unknown
+    light_intensities: Float64Array  # (F, 3) RGB; ones if unknown
     warnings: tuple[CaptureWarning, ...] = ()
-    # stored value from which an observation is saturated; None to find it
+    # stored value from which observations are saturated; None to determine it
     white_level: float | None = None
-    intensities_known: bool = True  # whether a file or the user gives the intensities
-    intensities_measured: bool = True  # whether a file gives the intensities
-    # the frame of the light file, in which the directions are no longer
+    intensities_known: bool = True  # from a file or the user
+    intensities_measured: bool = True  # from a file
+    # the frame of the light file; the directions are already in the usual frame
     light_frame: LightFrame = USUAL_FRAME
     # (3, 3) in pixels of whole images. None assumes an orthographic camera
     camera_matrix: Float64Array | None = None
@@ -93,7 +92,7 @@ class Source:
 
     @property
     def has_mask(self) -> bool:
-        """Whether the mask is given, so that none is found in the images."""
+        """Whether a mask is given, so that none is derived from the images."""
         return True
 
     @property
@@ -103,12 +102,14 @@ class Source:
 
     @property
     def lamps_may_differ(self) -> bool:
-        """Whether the lamps may have different colours: nobody says that they are equal."""
+        """Whether the lamps may have different colours, because nothing states that they are
+        equal.
+        """
         return self.intensities_measured or not self.intensities_known
 
     @property
     def has_positions(self) -> bool:
-        """Whether positions of lamps are known."""
+        """Whether lamp positions are known."""
         raise NotImplementedError
 
     @property
@@ -118,16 +119,16 @@ class Source:
 
     @property
     def is_linear(self) -> bool:
-        """Whether the stored values are taken as linear light."""
+        """Whether the stored values are treated as linear light."""
         return True
 
     @property
     def in_channels(self) -> bool:
-        """Whether each channel of a colour image has a light of its own."""
+        """Whether each channel of a colour image has its own light."""
         return False
 
     def divided_by(self, indices: Sequence[int], colours: Float64Array | None) -> Self:
-        """Return the source with images that are also divided by the colours (F, 3) of lamps."""
+        """Return the source with the images also divided by lamp colours (F, 3)."""
         if colours is None:
             return self
         intensities = self.light_intensities.copy()
@@ -139,13 +140,13 @@ class Source:
         raise NotImplementedError
 
     def mask_for(self, indices: Sequence[int]) -> Bools:
-        """Return the mask (H, W). Raises InputError if the sizes of these images differ, or the
-        memory is too small.
+        """Return the mask (H, W). Raises InputError if the images differ in size or memory is
+        insufficient.
         """
         raise NotImplementedError
 
     def read_ground_truth(self, mask: Bools) -> tuple[Float32Array | None, list[CaptureWarning]]:
-        """Return the true normals (H, W, 3) over a mask, or None, and warnings."""
+        """Return the true normals (H, W, 3) inside a mask, or None, and warnings."""
         return None, []
 
     def near_lamps(self, mask: Bools) -> tuple[NearLamps | None, list[CaptureWarning]]:
@@ -153,7 +154,9 @@ class Source:
         raise NotImplementedError
 
     def lamps_on_grid(self, mask: Bools, step: int) -> NearLamps | None:
-        """Return the near lamps over a mask (h, w) of every step-th row and column, or None."""
+        """Return the near lamps over a mask (h, w) of every step-th row and column, or None for
+        distant lights.
+        """
         raise NotImplementedError
 
     def mask_warnings(self, mask: Bools, indices: Sequence[int]) -> list[CaptureWarning]:
@@ -169,7 +172,7 @@ class Source:
         return False
 
     def equal_images(self, indices: Sequence[int]) -> list[tuple[int, int]]:
-        """Return the pairs of places of images whose files are equal."""
+        """Return pairs of positions of images whose files are equal."""
         return []
 
     def read_pixels(
@@ -181,9 +184,9 @@ class Source:
         wanted: Integers | slice = linearise.EVERY_PIXEL,
         around: Bools | None = None,
     ) -> Iterator[Item]:
-        """Yield use(...) of the pixels of a mask (H, W) under these lights.
+        """Yield use(...) of the pixels of a mask (H, W) under each of these lights.
 
-        Of these pixels (P,), the stored values are complete; for the linear ones, see
+        The stored values include all pixels (P,) of the mask; for the linear values, see
         pixel_reader.
         """
         raise NotImplementedError
@@ -191,23 +194,22 @@ class Source:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CaptureSource(Source):
-    """An opened capture: lights and facts of images loaded, pixels still on disk."""
+    """An opened capture on disk, whose lights and image headers are loaded."""
 
     files: CaptureFiles
     facts: tuple[ImageHeader, ...]
     radiometry: RadiometricCalibration = AS_STORED
-    # (H, W), made from the images instead of a file
+    # (H, W), derived from the images, not from a file
     automatic_mask: Bools | None = None
-    # the motion of the images, which is undone when they are read
+    # the motion of the images, which is compensated when they are read
     alignment: AlignedImages | None = None
-    lamps: LampFiles | None = None  # the near lamps of files and options, or None
-    # if each channel of a colour image is an image of its own
+    lamps: LampFiles | None = None  # the near lamps from files and options, or None
+    # if each channel of a colour image is treated as a separate image
     channels: ChannelLights | None = None
-    # the part of the images that is read. All masks but those in files have its size
+    # the part of the images that is read. All masks except those in files have its size
     window: Window = WHOLE
-    # JSON values that change when a file that is read for the capture, or the given white level,
-    # does. They are taken before reading, so a file that changed meanwhile has another stamp the
-    # next time
+    # JSON values that change whenever a file of the capture or the given white level changes. They
+    # are computed before reading, so a file modified meanwhile gets another stamp the next time
     stamp: tuple[Any, ...] = ()
 
     @property
@@ -243,8 +245,8 @@ class CaptureSource(Source):
         return self.channels is not None
 
     def image_names(self, indices: Sequence[int]) -> list[str]:
-        """Return the names of images for messages, with the channel if each channel is an image of
-        its own.
+        """Return the names of images for messages, including the channel if channels are separate
+        images.
         """
         names, numbers = [self.files.images[index].name for index in indices], self.files.kept
         if self.channels is None:
@@ -258,21 +260,25 @@ class CaptureSource(Source):
             return light_numbers
         for number in check_light_indices(light_numbers, self.files.kept[-1] + 1):
             if number not in self.files.kept:
-                hint = "Leave it out: its direction is wrong"
-                raise UsageError(f"light {number} was left out, and cannot be chosen", hint=hint)
+                hint = "Remove it from the choice, because its direction is invalid"
+                raise UsageError(
+                    f"light {number} cannot be chosen, because it was left out", hint=hint
+                )
         return [self.files.kept.index(number) for number in light_numbers]
 
     def read_ground_truth(self, mask: Bools) -> tuple[Float32Array | None, list[CaptureWarning]]:
         if self.files.ground_truth is None:
             return None, []
         truth, upside_down = read_ground_truth(self.files.ground_truth, self.window.whole(mask))
-        text = "The rows of the ground truth are in reverse order, so the map was flipped."
+        text = (
+            "The rows of the ground truth are in reverse order, so the map was flipped vertically."
+        )
         warnings = [CaptureWarning(GROUND_TRUTH_UPSIDE_DOWN, text)] * upside_down
         return self.window.of(truth), warnings
 
     def read_mask(self, shape: tuple[int, ...]) -> Bools:
-        """Return the mask (H, W) of the window on images of this shape. Raises InputError, also for
-        a huge shape.
+        """Return the mask (H, W) of the window on images of this shape. Raises InputError, for
+        example if the shape is too large.
         """
         if self.automatic_mask is not None:
             return self.automatic_mask
@@ -298,7 +304,7 @@ class CaptureSource(Source):
         if self.alignment is not None:
             mask = mask & self.alignment.common
         if not mask.any():
-            problem = "the mask has no pixel in the part that is read"
+            problem = "the mask has no pixels in the part that is read"
             hint = "Choose another --crop, or a larger --scale"
             raise InputError(problem, path=files.mask or files.folder, hint=hint)
         return mask
@@ -364,11 +370,11 @@ class CaptureSource(Source):
         wanted: Integers | slice = linearise.EVERY_PIXEL,
         around: Bools | None = None,
     ) -> Iterator[Item]:
-        """Yield use(...) of the pixels of a mask (H, W) under these lights. Other threads read the
-        next images, on each core one.
+        """Yield use(...) of the pixels of a mask (H, W) under each of these lights.
 
-        Of these pixels (P,), the stored values are complete; for the linear ones, see pixel_reader.
-        Raises InputError if an image cannot be read, or does not have the size of the mask.
+        Other threads read the next images, one per core. The stored values include all pixels (P,)
+        of the mask; for the linear values, see pixel_reader. Raises InputError if an image cannot
+        be read or does not have the size of the mask.
         """
         like = self.files.images[indices[0]].name
         pixels_of = linearise.pixel_reader(self.radiometry, mask, like, self.window, wanted, around)
@@ -397,7 +403,9 @@ class CaptureSource(Source):
         wanted: Integers | slice,
         around: Bools | None,
     ) -> Callable[[Path, int], tuple[Array, int, linearise.LightOf]]:
-        """Return a reader like pixel_reader's, of images that are moved back as a whole."""
+        """Return a reader as pixel_reader does, but for whole images whose motion is
+        compensated.
+        """
         whole = np.ones(self.facts[0].size[0][:2], np.bool_)
         read = linearise.pixel_reader(
             self.radiometry, whole, like, replace(self.window, box=None, step=1)
@@ -420,23 +428,23 @@ class CaptureSource(Source):
 
 
 def readers(largest: StoredSize, n_pixels: int) -> int:
-    """Return how many images are read at once: one on each core, unless they take more memory than
+    """Return how many images are read at once: one per core, unless they take more memory than
     capture_bytes allows.
     """
     height, width, *channels = largest[0]
-    # The file, its pixels, and the observations
+    # For the file, its pixels, and the observations
     each = height * width * (2 * math.prod(channels) * largest[1] + 4)
-    room = max(n_pixels * BYTES_OF_RESULTS, 1 << 29)  # PyTorch needs as much later
+    room = max(n_pixels * BYTES_OF_RESULTS, 1 << 29)  # PyTorch will need as much anyway
     return max(1, min(count_chosen_cores(), room // max(each, 1)))
 
 
 def read_ahead(
     read: Callable[[Item], Image], items: Sequence[Item], threads: int = 1
 ) -> Iterator[Image]:
-    """Yield read(item) of each item, in order. While one result is used, threads read the next.
+    """Yield read(item) for each item, in order. While a result is used, threads read the next ones.
 
     Decoders capture all output to file descriptor 2. If Python's stderr is the same descriptor, the
-    items are read one after the other, so that no message is lost.
+    items are read one at a time, so that no message is lost.
     """
     return (
         map(read, items)
@@ -446,10 +454,10 @@ def read_ahead(
 
 
 def capture_bytes(largest: StoredSize, n_pixels: int, n_lights: int) -> int:
-    """Return the memory in bytes that `infer` needs for a capture: float32 observations, and images
-    or results.
+    """Return the memory in bytes that `infer` needs for a capture: for float32 observations, and
+    for images or results.
     """
-    images = min(2, n_lights) * image_bytes(*largest)  # read_ahead has two
+    images = min(2, n_lights) * image_bytes(*largest)  # read_ahead holds two
     return n_pixels * 4 * n_lights + max(images, n_pixels * BYTES_OF_RESULTS)
 
 
@@ -458,7 +466,8 @@ def check_room(largest: StoredSize, n_pixels: int, n_lights: int, folder: Path) 
     height, width = largest[0][:2]
     check_memory(
         capture_bytes(largest, n_pixels, n_lights),
-        f"{n_lights} images of {width} x {height} pixels, {n_pixels} of them in the mask, take",
+        f"{n_lights} images of {width} x {height} pixels, of which {n_pixels} are in the mask,"
+        " take",
         folder,
         hint="Mask the object, reduce the images (infer --scale), or choose fewer lights",
     )
