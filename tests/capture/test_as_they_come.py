@@ -272,7 +272,7 @@ def test_pictures_of_results_are_left_out_where_the_count_says_so(folder):
     assert len(find_capture_files(folder, Overrides(needs_lights=False)).images) == 12
     for number in (12, 13):
         write_image(folder / f"{number:03}.png", PICTURES[0])
-    with refuses(r"found 12 light directions, expected 17.* it has none for 012\.png"):
+    with refuses(r"found 12 light directions, expected 17.* there is no light for 012\.png"):
         open_capture(folder)
 
 

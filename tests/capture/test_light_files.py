@@ -86,7 +86,7 @@ def test_directions_round_trip(vectors, separator, counted, transposed):
     assert_allclose(directions, unit(values), rtol=1e-12, atol=1e-15)
 
 
-COMMA = "A comma separates columns; write decimals with a point."
+COMMA = "Commas separate columns, so use a point as the decimal separator."
 
 
 @parametrize(
@@ -135,13 +135,13 @@ def test_files_that_are_no_text(tmp_path):
     put(tmp_path / "lights.txt", "0 0 1 # \u00e9", encoding="latin-1")
     for name, message in (
         ("none.txt", r"none\.txt: the file does not exist\."),
-        (".", r"found a folder, expected a text file with a line x y z for"),
+        (".", r"found a folder, expected a text file with one line x y z for"),
         ("lights.txt", r"the file is not UTF-8 text\. Save it as plain UTF-8 text\."),
-        ("mask.png", r"found an image, expected a text file with a line x y z for each image\."),
+        ("mask.png", r"found an image, expected a text file with one line x y z for each image\."),
     ):
         with refuses(message):
             read_light_directions(tmp_path / name)
-    with refuses(r"expected a text file with a line r g b for each image\."):
+    with refuses(r"expected a text file with one line r g b for each image\."):
         read_light_intensities(tmp_path / "mask.png", 3)
 
 
@@ -280,19 +280,19 @@ ADD_AZEL = ".*add --light-format azel"
         (
             "xyz",
             "0 30 1\n90 40 1\n180 45 1\n270 30 1",
-            f"and 1, expected x y z.*Leave the third{ADD_AZEL}",
+            f"and 1, expected x y z.*Remove the third{ADD_AZEL}",
         ),
         ("xyz", "a.png 0 30\nb.png 90 40\nc.png 180 45", f"a name and 2 numbers{ADD_AZEL}"),
         (
             "azel",
             "30 45\n120 100\n240 45",
-            r":2: found azimuth 120 and elevation 100, expected -360 to 360",
+            r":2: found azimuth 120 and elevation 100, expected azimuths from -360",
         ),
         ("azel", "30 45\n120 0\n240 45", r":2: found azimuth 120 and elevation 0, expected"),
         (
             "azel",
             "0.5 0.7\n2.1 0.8\n4.2 0.9",
-            "no angle is above 2 pi, so they look like radians.*57.2958",
+            "found no angle above 2 pi, which suggests radians.*57.2958",
         ),
         (
             "azel",
@@ -342,7 +342,7 @@ def test_refused_arrays(tmp_path):
     for array, message in (
         (np.zeros((4, 3), "U1"), "expected finite numbers N x 3"),
         (np.full((4, 3), np.nan), "expected finite numbers N x 3"),
-        (np.array({"a": 1}, object), "is damaged, or contains no array of numbers"),
+        (np.array({"a": 1}, object), "is damaged or does not contain an array of numbers"),
         (np.ones((5, 3)), "found 5 light directions, expected 4"),
     ):
         np.save(tmp_path / "lights.npy", array, allow_pickle=True)

@@ -96,7 +96,7 @@ def test_folders_that_are_no_capture(tmp_path):
         (
             "dark",
             Overrides(),
-            r"found 2 images \(.*\) but no light file\. A normal needs at least three photographs",
+            r"found 2 images \(.*\) but no light file\. Normals require at least three photographs",
         ),
         (
             "dark",

@@ -46,7 +46,7 @@ def test_masks_in_every_format(tmp_path, photographs, mask):
     for options in (CaptureOptions(), CaptureOptions(needs_lights=False)):
         source = open_capture(folder, options)
         assert source.n_lights == 12 and (source.read_mask(DISC.shape) == DISC).all()
-        chosen = f"{Path(mask).name} is used as the mask. To use another one, pass"
+        chosen = f"{Path(mask).name} is used as the mask. To use another mask, pass"
         found = any(str(warning).startswith(chosen) for warning in source.warnings)
         assert found == ("mask_choice" in codes(source)) == (not mask.startswith("mask."))
     balls = find_ball_files(folder)
@@ -58,7 +58,7 @@ def test_two_masks_are_named_by_all(folder):
         write(folder / name, MASK)
     write(folder / "small_mask.pgm", MASK[::2, ::2])
     text = (
-        "No mask is used, because several files may be the mask: a_mask.pgm, b.mask.png. Choose"
+        "No mask is used, because several files could be the mask: a_mask.pgm, b.mask.png. Choose"
         " one with --mask FILE."
     )
     source = open_capture(folder)
@@ -136,7 +136,7 @@ def test_a_gel_of_which_no_picture_is_clearly_without_contact(tmp_path):
     with refuses(r"shine at once, add --lights-in-channels"):
         open_capture(tmp_path)
     write_gel(tmp_path, ("ref.png", "3.png"))
-    with refuses(r"expected 12, three .* a folder of its own"):
+    with refuses(r"expected 12, three .* a separate folder"):
         open_capture(tmp_path, CaptureOptions(lights_in_channels=True))
 
 

@@ -114,9 +114,9 @@ def test_values_that_mean_nothing_are_refused(crop, scale, problem):
 
 
 def test_windows_that_do_not_fit_are_refused():
-    with refuses("--crop 0,0,5000,5 is not inside the image of"):
+    with refuses("--crop 0,0,5000,5 extends beyond the image of"):
         open_capture(MEDALLION, CaptureOptions(window=parse_window("0,0,5000,5", None)))
-    with refuses("no pixel in the part that is read"):
+    with refuses("no pixels in the part that is read"):
         prepare_capture(
             open_capture(MEDALLION, CaptureOptions(window=parse_window("0,0,3,3", None)))
         )
@@ -152,7 +152,7 @@ def test_a_part_is_lit_and_seen_as_in_the_whole(crop, scale, near, perspective, 
 
 def test_the_width_of_a_part_is_not_that_of_the_object():
     options = InferOptions(crop="31,22,50,47", light_distance=400.0, object_width=10.0)
-    with refuses("--object-width needs the whole object in the image", SplinecliError):
+    with refuses("--object-width requires the whole object to be in the image", SplinecliError):
         options.open(MEDALLION)
     narrow = prepare_capture(
         InferOptions(scale="1/3", light_distance=400.0, object_width=10.0).open(MEDALLION)

@@ -147,7 +147,7 @@ def test_two_masks_of_a_ball_are_named(run):
     write_balls("ball")
     for name in ("ball.mask.pgm", "old_mask.png"):
         write_image(f"ball/{name}", INSIDE.astype(np.uint8) * 255)
-    says = "several files may be the mask: ball.mask.pgm, old_mask.png. Choose one with"
+    says = "several files could be the mask: ball.mask.pgm, old_mask.png. Choose one with"
     run("calibrate ball", says=(says, "from picture"))
 
 
@@ -242,7 +242,9 @@ def test_a_display_encoded_target_is_reported(run):
         path.unlink()
     arguments = "calibrate ball --circle 60,48,40 --gray-ball gray --overwrite"
     asked = run(f"{arguments} --transfer linear").err  # the option that the warning below names
-    assert "as --transfer requests. Leave it out if" in asked and "Add --transfer" not in asked
+    assert (
+        "as requested by --transfer. Omit the option if" in asked and "Add --transfer" not in asked
+    )
     intensities = []
     for curve in ("srgb", "auto"):
         run(f"{arguments} --transfer {curve}")

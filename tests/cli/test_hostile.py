@@ -126,7 +126,7 @@ def test_a_list_of_images_stays_in_its_folder(capture, make_capture, run):
         ' "../elsewhere/image1.png" is outside the folder of the list.'
     )
     for command in ("infer --method ls", "info", "evaluate --method ls --n-lights 4"):
-        run(f"{command} {capture}", input_error=(message, "link to it from there"))
+        run(f"{command} {capture}", input_error=(message, "create a link to it there"))
     put(capture / "filenames.txt", "\n".join(str((elsewhere / n).absolute()) for n in names))
     run(f"info {capture}", input_error="is outside the folder of the list")
     # It may name links to images elsewhere.

@@ -96,12 +96,12 @@ def test_distant_lights_despite_positions_are_warned_of(infer, near):
 
 
 REFUSED = """
---light-distance 170 | 2 | --light-distance needs the size of a pixel
+--light-distance 170 | 2 | --light-distance requires the size of a pixel
 --light-distance 170 --light-positions l.txt | 2 | cannot be used together
 --pixel-size 1 --object-width 2 --light-distance 3 | 2 | cannot be used together
 --pixel-size -1 | 2 | --pixel-size is '-1'; expected a number above 0
 --surface --pixel-size 1e9 | 2 | the pixel size is 1e+09 mm, expected
---pixel-size 1 | 2 | --pixel-size needs near lamps, but bump has no light_positions.txt
+--pixel-size 1 | 2 | --pixel-size requires near lamps, but bump contains no light_positions.txt
 --light-positions l.txt --lights l.txt | 2 | cannot be used together
 --light-positions missing.txt | 3 | missing.txt: the file does not exist
 --light-positions l.txt | 3 | the scale of the lamp positions is unknown
@@ -191,12 +191,14 @@ def test_positions_in_another_unit_than_the_pixel_size(run, near, command):
     distances = np.linalg.norm(BUMP_LAMPS, axis=1) / 1000
     np.savetxt(near / "light_positions.txt", BUMP_LAMPS / 1000)
     lamp = (
-        f"lamp {distances.argmin() + 1} is {distances.min():.3g} from the middle of the object,"
-        " which is 64"
+        f"lamp {distances.argmin() + 1} is {distances.min():.3g} away from the centre of the"
+        " object, which is 64"
     )
-    words = "so it would be inside. Use one unit, such as millimetres, for all lengths"
+    words = (
+        "so it would be inside the object. Use the same unit, such as millimetres, for all lengths"
+    )
     run(f"{arguments} --strict", input_error=(lamp, words))
-    far = "so far away that their light is parallel"
+    far = "so far away that their light is practically parallel"
     for factor, words in ((0.3, "A lamp is very near"), (1000, far)):
         np.savetxt(near / "light_positions.txt", BUMP_LAMPS * factor)
         for strict, code in (("--strict", 3), ("", 0)):

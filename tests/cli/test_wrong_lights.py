@@ -52,7 +52,7 @@ def test_lights_that_all_point_away(run, medallion):
     write_lights(medallion, lambda lights: -lights)
     run(
         f"infer {medallion} --method ls",
-        input_error="z points away from the camera in this file: add --light-frame z-away",
+        input_error="z points away from the camera in this file, so add --light-frame z-away",
     )
 
 

@@ -153,7 +153,7 @@ def test_values_no_photograph_has(tmp_path, value, found):
     tifffile.imwrite(path, np.array([[1, value]], np.float32))
     with refuses(rf"a\.tif: found {found}.*expected a photograph\.") as caught:
         read_image(path)
-    assert ("Set values below zero" in str(caught.value)) == (value == -0.5)
+    assert ("Set negative values" in str(caught.value)) == (value == -0.5)
 
 
 def test_files_that_are_no_such_image(tmp_path):
@@ -168,7 +168,7 @@ def test_files_that_are_no_such_image(tmp_path):
         (".", "found a folder, expected an image"),
         ("empty.tif", "the file is empty"),
         ("header.tif", "the TIFF is damaged and cannot be read"),
-        ("int.tif", "found int32 pixels, expected 8-bit, 16-bit or floating-point ones"),
+        ("int.tif", "found int32 pixels, expected 8-bit, 16-bit or floating-point pixels"),
         ("palette.tif", "colour model PALETTE, expected gray or RGB"),
     ):
         with refuses(message):

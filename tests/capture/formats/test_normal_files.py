@@ -119,7 +119,7 @@ def test_damaged_and_unknown_files_and_other_sizes(tmp_path, normals):
     with refuses("does not exist"):
         read_normals(tmp_path / "none.npy", MASK)
     np.save(tmp_path / "pickled.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    with refuses("contains no array of numbers"):
+    with refuses("does not contain an array of numbers"):
         read_normals(tmp_path / "pickled.npy", MASK)
     for name, message in [("a.mat", "MATLAB file is damaged"), ("a.npy", r"\.npy file is damaged")]:
         path = write(tmp_path / name, normals)

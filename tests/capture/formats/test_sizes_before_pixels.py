@@ -37,7 +37,7 @@ from splinecli.recipe import RecipeOptions, prepare_capture
 HUGE = 30_000
 SMALL = (16, 18)
 TOO_LARGE = (
-    r"(30|21)000 x (30|21)000 pixels, which takes \d+\.\d GB of memory; expected at most 400 "
+    r"(30|21)000 x (30|21)000 pixels, which takes \d+\.\d GB of memory, expected at most 400 "
     r"megapixels"
 )
 MOST_GROWTH = 300 * 2**20
@@ -315,7 +315,7 @@ def test_a_depth_with_a_thousand_channels(tmp_path):
     library.File(parts).write(str(tmp_path / "parts.exr"))
     size = ExpectedSize(depth.shape, "the normal map")
     for name, count in (("a.exr", 1000), ("parts.exr", 300)):
-        message = f"found {count} channels, expected at most 256. Save the depth alone"
+        message = f"found {count} channels, expected at most 256. Save only the depth channel"
         refused(lambda name=name: read_depth(tmp_path / name, size), message)
 
 

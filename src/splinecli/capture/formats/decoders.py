@@ -1,5 +1,5 @@
-"""Decoders of TIFF and of camera RAW files, and the errors that all decoders raise for damaged
-ones.
+"""Decoders for TIFF and camera RAW files, and the error handling for damaged files that all
+decoders share.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ DAMAGED, COPY_AGAIN = "the image is damaged and cannot be read", "Copy or export
 
 @contextmanager
 def damage_as_input_error(path: Path, problem: str, hint: str | None = None) -> Iterator[None]:
-    """Convert any exception that a reader raises for a damaged file, one of a dozen types, to an
+    """Convert any of the dozen types of exceptions that readers raise for a damaged file to an
     InputError.
     """
     try:
@@ -54,7 +54,7 @@ def damage_as_input_error(path: Path, problem: str, hint: str | None = None) -> 
 
 
 class _Redirected:
-    """File descriptor 2, redirected to a file while `users` threads decode."""
+    """File descriptor 2, redirected to a file while `users` threads are decoding."""
 
     def __init__(self) -> None:
         self.turn, self.changed, self.users = threading.Lock(), threading.Condition(), 0
@@ -62,12 +62,12 @@ class _Redirected:
         self._original = -1
 
     def enter(self) -> tuple[BinaryIO | None, int]:
-        """Return the file, or None without a stderr, and its length before this thread's
+        """Return the file, or None if there is no stderr, and its length before this thread's
         messages.
         """
         self.users += 1
         if self.users == 1:
-            with suppress(OSError, ValueError):  # without a stderr, nothing needs protection
+            with suppress(OSError, ValueError):  # without a stderr, there is nothing to protect
                 if sys.stderr is not None:
                     sys.stderr.flush()
                 self._original = os.dup(2)
@@ -91,12 +91,12 @@ _STDERR = _Redirected()
 
 @contextmanager
 def native_stderr(*, alone: bool = False) -> Iterator[list[str]]:
-    """Capture the messages that C libraries print to stderr; after the block, the list contains
-    them.
+    """Capture the messages that C libraries print to stderr, in a list that is filled after the
+    block.
 
     This replaces file descriptor 2, which belongs to the whole process, so use it only around
-    decoding. Output of other threads is lost meanwhile, unless it goes elsewhere (stderr_is_apart).
-    Several threads may decode at once. The list then contains the messages of all of them, unless
+    decoding. Meanwhile, output of other threads is lost unless it goes elsewhere (stderr_is_apart).
+    Several threads may decode at once; the list then contains the messages of all of them, unless
     the block waits until it is `alone`.
     """
     messages: list[str] = []
@@ -115,7 +115,9 @@ def native_stderr(*, alone: bool = False) -> Iterator[list[str]]:
 
 
 def _read_from(descriptor: int, start: int) -> bytes:
-    """Return the bytes of a file after `start`, without moving the place where others write."""
+    """Return the bytes of a file after `start`, without moving the position at which others
+    write.
+    """
     if hasattr(os, "pread"):
         return os.pread(descriptor, 1 << 20, start)
     place = os.lseek(descriptor, 0, os.SEEK_CUR)  # Windows
@@ -126,12 +128,12 @@ def _read_from(descriptor: int, start: int) -> bytes:
 
 
 def stderr_is_apart() -> bool:
-    """Return whether Python's stderr is not file descriptor 2, so that nothing is lost while
-    native_stderr catches.
+    """Return whether Python's stderr is not file descriptor 2, so that native_stderr does not
+    swallow its output.
     """
     try:
         return sys.stderr is None or sys.stderr.fileno() != 2
-    except (OSError, ValueError):  # a stream without a descriptor
+    except (OSError, ValueError):  # the stream has no descriptor
         return True
 
 
@@ -140,18 +142,17 @@ _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _YCBCR = 0, 1, 2, 6
 
 
 def decode_tiff(file: BinaryIO, path: Path) -> Array | None:
-    """Return the first picture of a TIFF file as stored, (H, W) or (H, W, samples); None for one
-    that OpenCV decodes.
+    """Return the first picture of a TIFF file as stored, (H, W) or (H, W, samples), or None if
+    OpenCV must decode it.
 
-    Values grow with brightness: if zero is white in the file, the values are inverted, as in
-    viewers. tifffile reads every sample format, but has no decoder for some compressions (LZW).
-    Raises InputError if the file is truncated, damaged, or of a kind without linear gray or RGB
-    values.
+    Values increase with brightness: if zero means white in the file, the values are inverted, as
+    viewers do. tifffile reads every sample format but lacks decoders for some compressions (LZW).
+    Raises InputError if the file is truncated or damaged, or does not contain gray or RGB values.
     """
     with first_page(file, path) as page:
-        # A part may expand to a thousand times the size of its pixels. So may a tile far larger
-        # than the picture. Empty parts have up to 2^16 bytes, such as the tables of a JPEG, and
-        # tiles up to 2^24 more than the picture.
+        # A malicious part may expand to a thousand times the size of its pixels, and so may a tile
+        # far larger than the picture. Legitimate parts without pixels, such as the tables of a
+        # JPEG, have up to 2^16 bytes, and tiles up to 2^24 more than the picture.
         expanded = math.prod(page.chunks) * page.dtype.itemsize
         longest = max(page.databytecounts, default=0)
         if expanded > 2 * page.nbytes + (1 << 24) or longest > 2 * expanded + (1 << 16):
@@ -176,14 +177,16 @@ def decode_tiff(file: BinaryIO, path: Path) -> Array | None:
     return pixels
 
 
-_MOST_PAGES = 10_000  # of a TIFF file whose pages are images
-MASK_PAGE = -1  # the number of the mask of a .mat file with photographs
+_MOST_PAGES = 10_000  # in a TIFF file whose pages are treated as images
+MASK_PAGE = -1  # the number that stands for the mask in a .mat file with photographs
 _PAGE = re.compile(r"(.+\.(?:tiff?|mat))\[(\d{1,4}|mask)\]", re.IGNORECASE)
 
 
 def page_of(path: Path) -> tuple[Path, int]:
-    """Return the file and the number, from 0, of a picture in it: a page as `pages` names it, or a
-    photograph or the mask of a .mat file, such as a.mat[0] and a.mat[mask]; 0 for any other path.
+    """Return the file and the zero-based number of a picture in it.
+
+    The path ends with a page, as named by `pages`, or with a photograph or the mask in a .mat file,
+    as in a.mat[0] or a.mat[mask]. The number is 0 for any other path.
     """
     found = _PAGE.fullmatch(path.name)
     if found is None:
@@ -192,8 +195,8 @@ def page_of(path: Path) -> tuple[Path, int]:
 
 
 def pages(path: Path) -> list[Path]:
-    """Return a path for each page of a TIFF file, such as stack.tif[0]; the file alone for another
-    or a damaged one.
+    """Return a path for each page of a TIFF file, such as stack.tif[0], or only the file itself if
+    it has a single page, is damaged, or is in another format.
     """
     try:
         with path.open("rb") as file, first_page(file, path) as page:
@@ -207,13 +210,13 @@ def pages(path: Path) -> list[Path]:
 
 @contextmanager
 def first_page(file: BinaryIO, path: Path) -> Iterator[Any]:
-    """Yield the first page of an open TIFF file, or the page in the path. Raises InputError for a
-    damaged file.
+    """Yield the first page of an open TIFF file, or the page named in the path. Raises InputError
+    for a damaged file.
     """
     import tifffile
 
     logger = logging.getLogger("tifffile")
-    before, logger.disabled = logger.disabled, True  # our error says all that a user needs
+    before, logger.disabled = logger.disabled, True  # our error is all that a user needs
     try:
         with damage_as_input_error(path, "the TIFF is damaged and cannot be read", COPY_AGAIN):
             stored, number = page_of(path)
@@ -232,16 +235,16 @@ def first_page(file: BinaryIO, path: Path) -> Iterator[Any]:
 
 @lru_cache(maxsize=4)
 def _all_places(path: Path, *_: int) -> tuple[int, ...]:
-    """Return the results of _places, kept because each page of a file is opened separately."""
+    """Return the results of _places, cached because each page of a file is opened separately."""
     with path.open("rb") as file:
         return tuple(_places(file))
 
 
 def _places(file: BinaryIO) -> Iterator[int]:
-    """Yield the places of the pages in an open TIFF file.
+    """Yield the offsets of the pages in an open TIFF file.
 
     Raises ValueError for too many tags, or for a tag with millions of values, because tifffile
-    reads tags as a whole.
+    reads whole tags.
     """
     start = file.read(16)
     order: Literal["little", "big"] = "little" if start[:1] == b"I" else "big"
@@ -262,7 +265,7 @@ def _places(file: BinaryIO) -> Iterator[int]:
         for at in range(0, len(entries), entry):
             tag = int.from_bytes(entries[at : at + 2], order)
             values = int.from_bytes(entries[at + 4 : at + 4 + bytes_of], order)
-            # Tags with one value for each strip or tile; others, such as colour profiles, have
+            # These tags have one value per strip or tile; others, such as colour profiles, have
             # more.
             if values > (1 << 18 if tag in (273, 279, 324, 325) else 1 << 24):
                 raise ValueError
@@ -270,8 +273,8 @@ def _places(file: BinaryIO) -> Iterator[int]:
 
 
 def tiff_content(file: BinaryIO, path: Path) -> bytes | bytearray:
-    """Return the content of an open TIFF file; for one of its pages, of a BigTIFF file with this
-    page alone.
+    """Return the content of an open TIFF file or, if the path names a page, a BigTIFF file with
+    only this page.
     """
     if page_of(path)[0] == path:
         return file.read()
@@ -293,7 +296,7 @@ def tiff_content(file: BinaryIO, path: Path) -> bytes | bytearray:
         struct.pack_into(order + "2sHHHQQ", content, 0, start, 43, 8, 0, 16, len(tags))
         for number, tag in enumerate(tags):
             kind, value = int(tag.dtype), read(tag.valueoffset, tag.valuebytecount)
-            if tag.code in (273, 324):  # the places of strips or tiles, as numbers of 8 bytes
+            if tag.code in (273, 324):  # the offsets of strips or tiles, as 8-byte numbers
                 kind, value = 16, struct.pack(f"{order}{len(places)}Q", *places)
             if len(value) > 8:
                 value = struct.pack(order + "Q", append(value))
@@ -303,12 +306,12 @@ def tiff_content(file: BinaryIO, path: Path) -> bytes | bytearray:
 
 
 def _decode_page(page: Any) -> Array | None:
-    """Return pixels (H, W) or (H, W, samples); None if tifffile has no decoder or fails."""
+    """Return pixels (H, W) or (H, W, samples), or None if tifffile has no decoder or fails."""
     if int(page.photometric) == _YCBCR:
         return None
     try:
         pixels: Array = page.asarray()
-    except Exception as error:  # of a type that depends on tifffile's version for a missing codec
+    except Exception as error:  # for a missing codec, the type depends on tifffile's version
         if is_out_of_memory(error):
             raise
         return None
@@ -344,11 +347,13 @@ RAW_SUFFIXES = (
     ".dcr",
     ".x3f",
 )
-"""RAW files are recognised by their names, because the content of many looks like TIFF."""
+"""Suffixes of RAW files. They are recognised by name, because many have the content of a TIFF
+file.
+"""
 
 
 def raw_size(path: Path) -> tuple[tuple[int, int, int], int]:
-    """Return the shape (H, W, 3) of decode_raw's pixels, and the bytes of each number. Raises
+    """Return the shape (H, W, 3) of decode_raw's pixels, and the bytes per value. Raises
     InputError.
     """
     with (
@@ -361,15 +366,15 @@ def raw_size(path: Path) -> tuple[tuple[int, int, int], int]:
 
 
 def decode_raw(content: bytes, path: Path) -> NDArray[np.uint16]:
-    """Return the pixels (H, W, C) of a camera's RAW file, C 3 (the camera's red, green and blue) or
-    1 (no filters).
+    """Return the pixels (H, W, C) of a camera's RAW file, where C is 3 (the camera's red, green and
+    blue) or 1 (no colour filters).
 
-    They are proportional to light, from 0 at the sensor's black to 65535 where a photosite is
-    saturated. All files of a camera at one setting have the same scale. An orientation is ignored,
+    Values are proportional to light, from 0 at the sensor's black level to 65535 at saturation,
+    with the same scale for all files of a camera at the same settings. The orientation is ignored,
     as in all images. Raises InputError if rawpy is not installed, or LibRaw cannot read the file.
     """
     with _libraw(path) as rawpy:
-        with native_stderr():  # kept short, because it also blocks progress bars
+        with native_stderr():  # kept short, because it also suppresses progress bars
             raw = rawpy.imread(io.BytesIO(content))
             raw.unpack()
         with raw:
@@ -377,17 +382,17 @@ def decode_raw(content: bytes, path: Path) -> NDArray[np.uint16]:
                 output_color=rawpy.ColorSpace.raw,
                 output_bps=16,
                 gamma=(1, 1),
-                # Other white balances differ between images, or bring red and blue to full scale
-                # before saturation.
+                # Any other white balance may differ between images, or scale red and blue beyond
+                # the saturation level.
                 user_wb=[1, 1, 1, 1],
                 no_auto_bright=True,
-                # the default is each image's own maximum, if that is near
+                # by default, it may be the maximum of each image
                 user_sat=_full_scale(raw),
                 highlight_mode=rawpy.HighlightMode.Clip,
                 user_flip=0,
-                # Others interpolate differently under each light: normals of textured objects have
-                # two to three times the error (AHD 1.4 degrees, LINEAR 0.5), but uniform objects
-                # have half the error (0.2, 0.4).
+                # Other algorithms interpolate differently under each light. They double or triple
+                # the errors on textured objects (AHD 1.4 degrees, LINEAR 0.5), but halve them on
+                # uniform objects (0.2 and 0.4 degrees).
                 demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
             )
     # Some sensors have four colours. The fourth must not become an alpha channel.
@@ -395,10 +400,10 @@ def decode_raw(content: bytes, path: Path) -> NDArray[np.uint16]:
 
 
 def read_shot(path: Path) -> tuple[float, float, float]:
-    """Return exposure time in seconds, f-number and ISO sensitivity, each zero where the file does
-    not state it.
+    """Return exposure time in seconds, f-number and ISO sensitivity, each zero if the file does not
+    state it.
 
-    LibRaw unpacks all pixels for this, so use it only for files that nothing else reads. Raises
+    LibRaw unpacks all pixels for this, so use it only for files that Pillow cannot read. Raises
     InputError.
     """
     with (
@@ -412,27 +417,27 @@ def read_shot(path: Path) -> tuple[float, float, float]:
 def _full_scale(raw: rawpy.RawPy) -> int:
     """Return the value above black from which a photosite is considered saturated."""
     white = raw.white_level
-    # LibRaw gives the largest number. Many sensors saturate below it, and some files state the
-    # level. A level far from the largest number is in another unit.
+    # LibRaw returns the largest possible value. Many sensors saturate below it, and some files
+    # state that level. A level far from the largest value is in another unit.
     stated = raw.camera_white_level_per_channel
     if stated is not None and white / 2 <= min(stated) <= white:
         white = min(stated)
-    # The black levels of the colours differ a little, and the colour with the highest must reach
-    # full scale, too. It is one less because LibRaw drops decimals after scaling: otherwise every
-    # seventh white level would end at 65534.
+    # The black levels of the colours differ slightly, and the colour with the highest level must
+    # also reach full scale. The result is one less because LibRaw truncates after scaling, and
+    # otherwise every seventh white level would end at 65534.
     return max(white - max(raw.black_level_per_channel) - 1, 1)
 
 
 @contextmanager
 def _libraw(path: Path) -> Iterator[ModuleType]:
-    """Yield rawpy, and convert its errors for a damaged file to an InputError."""
+    """Yield rawpy, and convert the errors that it raises for a damaged file to an InputError."""
     otherwise = "export the photographs as 16-bit linear TIFF"
     rawpy = import_extra("rawpy", "raw", error=InputError, path=path, otherwise=otherwise)
     try:
         yield rawpy
     except (rawpy.LibRawError, OSError):
         raise InputError(
-            "the RAW file is damaged, or from a camera that LibRaw does not support",
+            "the RAW file is damaged or from a camera that LibRaw does not support",
             path,
             hint=f"Copy it again, or {otherwise}",
         ) from None

@@ -1,8 +1,8 @@
-"""The facts of an image file, read from its header in one pass: size, transfer curve, white level
-and EXIF tags.
+"""The facts in the header of an image file, read in one pass: size, transfer curve, white level and
+EXIF tags.
 
-The parts before the pixels are parsed here, with limits, because Pillow reads malicious ones
-indefinitely. Pillow reads the EXIF tags, and tifffile the tags of TIFF.
+The parts before the pixels are parsed here, with limits, because Pillow may read malicious ones
+indefinitely. EXIF tags are read by Pillow, and TIFF tags by tifffile.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ _BRANDS = {
     b"heix": "HEIF",
     b"mif1": "HEIF",
 }
-"""The first bytes of the files, or the bytes from the ninth on, after a length and RIFF or ftyp."""
+"""The first bytes of files or, after a length and RIFF or ftyp, the bytes from the ninth on."""
 
-PILLOW_KINDS = ("BMP", "TGA", "WEBP", "AVIF", "HEIF")  # kinds of files that Pillow reads, of 8 bits
-# The groups are width, height and the largest value
+PILLOW_KINDS = ("BMP", "TGA", "WEBP", "AVIF", "HEIF")  # 8-bit formats that Pillow decodes
+# The groups are the width, the height and the largest value
 _PNM = re.compile(rb"P[56]" + 3 * rb"(?:\s|#[^\n]*\n)+?(\d{1,9})" + rb"\s")
-# The shape (H, W, C) of an image as stored, and the bytes of each number
+# The shape (H, W, C) of an image as stored, and the bytes per value
 StoredSize = tuple[tuple[int, ...], int]
 
 ORIENTATION, _EXIF = 0x0112, 0x8769
-# EXIF tags of exposure time, f-number and ISO sensitivity, and the range that cameras can have
+# EXIF tags of exposure time, f-number and ISO sensitivity, and the ranges of real cameras
 _EXPOSURE = {0x829A: (1e-6, 1e5), 0x829D: (0.1, 1e3), 0x8827: (1.0, 1e7)}
-# Also those of the focal length; see balls.py
+# Includes the tags of the focal length; see balls.py
 _KEPT = (*_EXPOSURE, 0x920A, 0xA002, 0xA20E, 0xA210, 0xA402, 0xA403, 0xA405)
-# Most chunks of a PNG before its pixels, or segments of a JPEG before its frame: usually dozens
+# Most chunks before the pixels of a PNG, or segments before the frame of a JPEG. Dozens are usual
 _MOST_PARTS = 10_000
 
 
@@ -73,18 +73,18 @@ class UnknownFormatError(InputError):
 class StatedCurve:
     """The transfer curve that a file states."""
 
-    curve: TransferCurve = 1.0  # see TransferCurve; linear if the file states none
-    by: str = ""  # the source of the curve, for messages; empty for none
-    unread: bool = False  # whether there is a colour profile whose curve cannot be read
+    curve: TransferCurve = 1.0  # linear if the file states none; see TransferCurve
+    by: str = ""  # where it is stated, for messages; empty if it is not stated
+    unread: bool = False  # whether the curve of a colour profile cannot be read
 
 
-_ENCODED = StatedCurve(SRGB, "PNG that says so")
+_ENCODED = StatedCurve(SRGB, "PNG with sRGB or gAMA")
 _CODE_POINTS = dict.fromkeys((1, 6, 14, 15), StatedCurve(BT709, "PNG of a video")) | {
     8: StatedCurve(),
     13: _ENCODED,
 }
-"""Transfer curves by their numbers in a PNG's chunk cICP (ITU-T H.273), which takes precedence over
-all others.
+"""Transfer curves by their numbers in the cICP chunk of a PNG (ITU-T H.273), which takes precedence
+over all other chunks.
 """
 
 
@@ -95,20 +95,21 @@ class ImageHeader:
     path: Path
     kind: str = ""  # "PNG", "JPEG", "TIFF", "BMP", "TGA", "RAW" or "MAT"; empty for none
     stated_size: StoredSize | None = None  # None for a RAW file, and for a damaged one
-    # from cICP or a colour profile, else sRGB for JPEG and PNG with sRGB or gAMA
+    # from cICP or a colour profile; otherwise sRGB for JPEG, and for PNG with sRGB or gAMA
     curve: StatedCurve = StatedCurve()
-    # the white level of a 16-bit image, 2^bits - 1 if the file states bits; None without one. It is
-    # in the unit of the decoded values: full scale for a RAW file, regardless of its tags
+    # white level of a 16-bit image, 2^bits - 1 if the file states the number of bits; None if
+    # unknown. It is in the unit of the decoded values, so it is full scale for a RAW file
+    # regardless of its tags
     white_level: int | None = None
-    # orientation, exposure and focal length, by numbers of tags; None for a RAW file that only
-    # LibRaw reads
+    # orientation, exposure and focal length by tag number; None for a RAW file that only LibRaw can
+    # read
     exif: Mapping[int, Any] | None = field(default_factory=dict)
-    # why the file cannot be read. It is raised when the size is requested
+    # why the file cannot be read; raised when the size is requested
     damage: InputError | None = None
 
     @property
     def stated_channels(self) -> int | None:
-        """The number of channels, with alpha; None if the header states none."""
+        """The number of channels, including alpha, or None if the header does not state it."""
         return None if self.stated_size is None else (*self.stated_size[0], 1)[2]
 
     @cached_property
@@ -124,7 +125,7 @@ class ImageHeader:
 
 
 def read_header(path: Path) -> ImageHeader:
-    """Return the facts of an image file. It is opened once; nothing is decoded."""
+    """Return the facts of an image file. It is opened once, and no pixels are decoded."""
     try:
         with open_image(path) as (file, kind):
             return facts_in(file, kind, path)
@@ -134,7 +135,7 @@ def read_header(path: Path) -> ImageHeader:
 
 @contextmanager
 def open_image(path: Path) -> Iterator[tuple[BinaryIO, str]]:
-    """Yield an image file, opened, and its kind: by its content, for RAW by its name. Raises
+    """Yield an opened image file and its kind, recognised by content or, for RAW, by name. Raises
     InputError.
     """
     stored, _ = decoders.page_of(path)
@@ -160,7 +161,7 @@ def facts_in(file: BinaryIO, kind: str, path: Path) -> ImageHeader:
     """Return the facts of an open image file. Raises InputError for a damaged TIFF."""
     if kind == "RAW":
         exif = _exif_tags(lambda tags: tags.load_from_fp(file))
-        # The white level is that of developed RAW files; see decode_raw.
+        # This is the white level of developed RAW files; see decode_raw.
         return ImageHeader(path, kind, white_level=65_535, exif=exif)
     if kind == "MAT":
         return ImageHeader(path, kind, mat.picture_size(path))
@@ -184,8 +185,8 @@ def facts_in(file: BinaryIO, kind: str, path: Path) -> ImageHeader:
 
 
 def pnm_header(start: bytes) -> tuple[int, int, int, int] | None:
-    """Return width, height, largest value and place of the pixels of a PGM or PPM; None for a
-    damaged one.
+    """Return the width, height, largest value and offset of the pixels of a PGM or PPM, or None if
+    it is damaged.
     """
     found = _PNM.match(start[:4096])
     return None if found is None else (int(found[1]), int(found[2]), int(found[3]), found.end())
@@ -193,7 +194,7 @@ def pnm_header(start: bytes) -> tuple[int, int, int, int] | None:
 
 @contextmanager
 def open_with_pillow(file: BinaryIO, kind: str, path: Path) -> Iterator[Image.Image]:
-    """Yield a picture of PILLOW_KINDS, whose pixels are not read yet. Raises InputError."""
+    """Yield a picture of PILLOW_KINDS without reading its pixels. Raises InputError."""
     from PIL import Image
 
     if kind == "HEIF":
@@ -202,7 +203,7 @@ def open_with_pillow(file: BinaryIO, kind: str, path: Path) -> Iterator[Image.Im
             "pillow_heif", "heif", error=InputError, path=path, otherwise=otherwise
         ).register_heif_opener()
     with decoders.damage_as_input_error(path, decoders.DAMAGED), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of large pictures, which are checked later
+        warnings.simplefilter("ignore")  # about large pictures, which are checked later
         yield Image.open(file, formats=[kind])
 
 
@@ -227,14 +228,14 @@ def _png_facts(file: BinaryIO, path: Path) -> ImageHeader:
             profile = zlib.decompressobj().decompress(compressed[1:], LARGEST_PROFILE)
         except zlib.error:
             profile = b""
-    # 100000 times the exponent of the encoding: 1 means linear.
+    # 100000 times the exponent of the encoding; an exponent of 1 means linear.
     gamma = int.from_bytes(chunks.get(b"gAMA", b"")[:4], "big")
     encoded = b"sRGB" in chunks or gamma not in (0, 100_000)
     curve = _curve(_ENCODED if encoded else StatedCurve(), profile)
     if b"cICP" in chunks:
         code = int.from_bytes(chunks[b"cICP"][1:2], "big")
         curve = _CODE_POINTS.get(code, StatedCurve(unread=True))
-    # One number for each channel. Alpha, if there is one, comes last.
+    # One number per channel. Alpha, if present, comes last.
     stated = chunks.get(b"sBIT", b"")
     bits = set(stated[: 3 if len(stated) > 2 else 1])
     level = _level(bits.pop()) if size is not None and size[1] == 2 and len(bits) == 1 else None
@@ -254,7 +255,7 @@ def _jpeg_facts(file: BinaryIO, path: Path) -> ImageHeader:
             number = file.read(2)[:1]
             parts[number] = file.read(length - 14)
     profile = None
-    if parts:  # b"" is treated as an unreadable one
+    if parts:  # b"" is treated as an unreadable profile
         short = sum(map(len, parts.values())) <= LARGEST_PROFILE
         profile = b"".join(parts[number] for number in sorted(parts)) if short else b""
     curve = _curve(StatedCurve(SRGB, "JPEG"), profile)
@@ -262,8 +263,8 @@ def _jpeg_facts(file: BinaryIO, path: Path) -> ImageHeader:
 
 
 def _jpeg_segments(file: BinaryIO) -> Iterator[tuple[int, int]]:
-    """Yield marker and length of the segments up to a JPEG's frame, with the file at each one's
-    content.
+    """Yield the marker and length of each segment up to the frame of a JPEG, with the file
+    positioned at its content.
     """
     start, marker = 2, 0
     for _ in range(_MOST_PARTS):
@@ -304,7 +305,7 @@ def _tiff_facts(file: BinaryIO, path: Path) -> ImageHeader:
     if bits == 16 and white is not None and 0 < white < 65_535:
         level = white
     elif bits == 16 and largest is not None and largest == _level(largest.bit_length()):
-        level = largest  # of any other number it may be the largest value of this image
+        level = largest  # any other number may be the largest value of this image
     elif bits < 16:
         level = _level(bits)
     exif = _exif_tags(load) if has_exif else {}  # Pillow reads all tags, however long
@@ -322,7 +323,7 @@ def _level(bits: int) -> int | None:
 
 
 def _curve(stated: StatedCurve, profile: bytes | None) -> StatedCurve:
-    """Return the curve of a profile, or the otherwise stated curve if the profile is missing or
+    """Return the curve of a profile, or the curve stated elsewhere if the profile is missing or
     unreadable.
     """
     if profile is None:
@@ -335,13 +336,13 @@ def _curve(stated: StatedCurve, profile: bytes | None) -> StatedCurve:
 
 
 def _exif_tags(load: Callable[[Image.Exif], object]) -> dict[int, Any] | None:
-    """Return the tags that are kept, empty for damaged ones; None for a RAW file of its maker's own
+    """Return the tags to keep, none if they are damaged; or None for a RAW file in a proprietary
     format.
     """
     from PIL import Image
 
     tags, found = Image.Exif(), dict[int, Any]()
-    with warnings.catch_warnings():  # Pillow warns of tags that it does not expect
+    with warnings.catch_warnings():  # Pillow warns about unexpected tags
         warnings.simplefilter("ignore")
         try:
             load(tags)
@@ -351,12 +352,12 @@ def _exif_tags(load: Callable[[Image.Exif], object]) -> dict[int, Any] | None:
             found |= {tag: inside[tag] for tag in _KEPT if tag in inside}
         except SyntaxError:
             return None
-        except Exception:  # damaged tags cause a dozen types of errors; decoding names the damage
+        except Exception:  # damaged tags raise a dozen types of errors; decoding reports the damage
             pass
     return found
 
 
-UPRIGHT = 1  # orientation of images that are shown as they are stored
+UPRIGHT = 1  # orientation of images that viewers do not rotate
 
 
 class Exposure(NamedTuple):
@@ -368,7 +369,7 @@ class Exposure(NamedTuple):
 
     @property
     def relative(self) -> float:
-        """A number that the brightness of the image is proportional to."""
+        """A number proportional to the brightness of the image."""
         return self.seconds * self.iso / self.f_number**2
 
     def __str__(self) -> str:
@@ -377,15 +378,15 @@ class Exposure(NamedTuple):
 
 
 def find_exposure(facts: ImageHeader) -> Exposure | None:
-    """Return the exposure of an image; None if a part of it is missing or outside the range of real
-    cameras, or the file is damaged.
+    """Return the exposure of an image, or None if the file is damaged or a value is missing or
+    outside the range of real cameras.
     """
     try:
         if facts.exif is None and facts.kind == "RAW":
             numbers: tuple[Any, ...] = decoders.read_shot(facts.path)
         else:
             numbers = tuple((facts.exif or {})[tag] for tag in _EXPOSURE)
-        # Some cameras give two ISO numbers.
+        # Some cameras state two ISO numbers.
         exposure = Exposure(*(float(n[0] if isinstance(n, tuple) else n) for n in numbers))
     except Exception:  # damaged tags cause a dozen types of errors
         return None
@@ -400,22 +401,22 @@ def check_exposures(images: Sequence[ImageHeader]) -> None:
     ]
     for facts, exposure in found[1:]:
         first, expected = found[0]
-        # Shutters and ISO numbers are rounded.
+        # Stated shutter speeds and ISO numbers are rounded.
         if abs(exposure.relative / expected.relative - 1) > 0.1:
             raise InputError(
                 f"found an exposure of {exposure}, expected {expected} as in {first.path.name}",
                 facts.path,
-                hint="Expose all images alike, or give each image's exposure as the intensity of"
-                " its light (--intensities FILE)",
+                hint="Use the same exposure for all images, or pass each image's exposure as the"
+                " intensity of its light (--intensities FILE)",
             )
 
 
 def exposure_factors(images: Sequence[ImageHeader]) -> tuple[list[float], str] | None:
-    """Return the exposure of each image, relative to their mean, and a sentence about them; None
-    for equal ones.
+    """Return each image's exposure relative to their mean, and a sentence about them, or None if
+    they are equal.
 
-    Images without a stated exposure are refused beside images with different ones, as in
-    check_exposures.
+    Raises InputError, as check_exposures does, if the exposures differ and an image does not state
+    its exposure.
     """
     try:
         check_exposures(images)
@@ -429,23 +430,27 @@ def exposure_factors(images: Sequence[ImageHeader]) -> tuple[list[float], str] |
         choose(found, key=lambda exposure: exposure.relative) for choose in (min, max)
     )
     text = (
-        f"The images were divided by the exposures that EXIF states, from {darkest} to {brightest}."
+        f"The images were divided by their exposures from EXIF, which range from {darkest} to"
+        f" {brightest}."
     )
     tags = {"exposure": 0xA402, "white balance": 0xA403}  # 0 is automatic
     stated = [facts.exif or {} for facts in images]
     automatic = [word for word, tag in tags.items() if any(each.get(tag) == 0 for each in stated)]
     if automatic:
         chosen = " and ".join(automatic)
-        text += f" The camera chose {chosen}: fix them, and expose all images alike."
+        text += (
+            f" The camera chose the {chosen} automatically; use the same fixed settings for all"
+            " images."
+        )
     return [exposure.relative / mean for exposure in found], text
 
 
 def common_orientation(images: Sequence[ImageHeader]) -> int:
-    """Return the EXIF orientation that all images have, 1 to 8; UPRIGHT if they state none.
+    """Return the EXIF orientation of all images, 1 to 8, or UPRIGHT if they do not state one.
 
-    The orientation of RAW files is ignored: their pixels are read in the sensor's orientation.
-    Raises InputError for two images with different orientations, because their pixels do not
-    correspond.
+    The orientation of RAW files is ignored, because their pixels are read in the sensor's
+    orientation. Raises InputError if the orientations of two images differ, because their pixels do
+    not correspond.
     """
     asked = [facts for facts in images if facts.kind != "RAW"]
     stated = ((facts.exif or {}).get(ORIENTATION, UPRIGHT) for facts in asked)
@@ -456,6 +461,6 @@ def common_orientation(images: Sequence[ImageHeader]) -> int:
                 f"found EXIF orientation {orientation}, expected {orientations[0]} as in"
                 f" {asked[0].path.name}",
                 facts.path,
-                hint="Export all images the same way up, without this tag",
+                hint="Export all images in the same orientation, without this tag",
             )
     return orientations[0] if orientations else UPRIGHT

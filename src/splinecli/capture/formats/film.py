@@ -1,6 +1,6 @@
-"""Videos as captures: a fixed camera records an object while someone moves a lamp around it.
+"""Videos as captures: a fixed camera records an object while a lamp is moved around it.
 
-A few of the hundreds of frames are enough: sharp ones that are not overexposed and have very
+Of the hundreds of frames, a few are enough if they are sharp, not overexposed, and under very
 different lights.
 """
 
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     import cv2
 
 MOST_FRAMES, FEWEST_FRAMES = 24, 6
-_CANDIDATES = 1000  # most frames that are compared; longer videos are subsampled by 2, 4 and so on
+_CANDIDATES = 1000  # most frames compared; longer videos are subsampled by 2, 4 and so on
 # FFmpeg would also open playlists, which refer to other files, so only video containers are opened.
 _CONTAINERS = re.compile(rb"....(ftyp|moov|mdat|wide)|RIFF|\x1a\x45\xdf\xa3", re.DOTALL)
-# The number of a frame, its linear thumbnail, its sharpness and its share of clipped pixels
+# A frame's number, linear thumbnail, sharpness and share of clipped pixels
 _Candidate = tuple[int, Float32Array, float, float]
 
 
@@ -62,24 +62,25 @@ def choose_frames(film: Path) -> tuple[int, ...]:
     chosen = _farthest(thumbnails[usable])
     if len(chosen) < FEWEST_FRAMES:
         raise InputError(
-            f"found {len(chosen)} of {len(numbers)} frames that are sharp and under different"
-            f" lights, expected at least {FEWEST_FRAMES}",
+            f"found {len(chosen)} sharp frames under different lights among {len(numbers)},"
+            f" expected at least {FEWEST_FRAMES}",
             film,
-            hint="Record from a tripod while you move the lamp all around the object, with focus"
-            " and exposure locked",
+            hint="Record from a tripod with focus and exposure locked, while you move the lamp all"
+            " around the object",
         )
     return tuple(sorted(numbers[usable][chosen].tolist()))
 
 
 def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
-    """Yield frames by ascending number as stored: (H, W, 3) RGB, usually encoded with BT709.
+    """Yield frames as stored, (H, W, 3) RGB, usually encoded with BT.709; the numbers must be
+    ascending.
 
     Raises InputError.
     """
     with _opened(film) as video:
         place = 0
         for number in numbers:
-            with native_stderr():  # brief, because it also blocks progress bars
+            with native_stderr():  # kept short, because it also suppresses progress bars
                 while place <= number and video.grab():
                     place += 1
                 if place <= number:
@@ -89,7 +90,7 @@ def read_frames(film: Path, numbers: Iterable[int]) -> Iterator[NDArray[np.uint8
 
 
 def _candidates(film: Path) -> list[_Candidate]:
-    """Return evenly spaced frames with the measurements needed for choosing among them.
+    """Return evenly spaced frames with the measurements needed to choose among them.
 
     Raises InputError.
     """
@@ -139,9 +140,9 @@ def _candidate(number: int, picture: NDArray[np.uint8]) -> _Candidate:
 
 
 def _farthest(thumbnails: Float32Array) -> list[int]:
-    """Return the positions of thumbnails (N, P) that differ most, ignoring their brightness.
+    """Return the positions of the thumbnails (N, P) that differ most, ignoring their brightness.
 
-    Each is the farthest from those chosen before. Unit vectors less than 0.05 apart are considered
+    Each is the farthest from those already chosen. Unit vectors less than 0.05 apart are considered
     to have the same light.
     """
     if not len(thumbnails):
@@ -158,7 +159,7 @@ def _farthest(thumbnails: Float32Array) -> list[int]:
 
 @contextmanager
 def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
-    """Yield an opened video, and convert the errors of a damaged one to an InputError."""
+    """Yield an opened video, and convert the errors raised for a damaged video to an InputError."""
     import cv2
 
     check_file(film, "a video")
@@ -172,8 +173,8 @@ def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
                 hint="MP4, MOV, AVI, MKV and WebM files are supported",
             )
         file.seek(0)
-        # FFmpeg's threads also print between calls. OpenCV reads this before opening its first
-        # video.
+        # FFmpeg's threads also print between calls. OpenCV reads this variable when it opens the
+        # first video.
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
         with native_stderr():
             video = cv2.VideoCapture(utf8_name(film, file), cv2.CAP_FFMPEG)
@@ -192,7 +193,7 @@ def _opened(film: Path) -> Iterator[cv2.VideoCapture]:
 
 
 def _picture(video: cv2.VideoCapture) -> NDArray[np.uint8]:
-    """Return the frame that was grabbed last, (H, W, 3) in BGR order. Raises ValueError."""
+    """Return the most recently grabbed frame, (H, W, 3) in BGR order. Raises ValueError."""
     done, picture = video.retrieve()
     if not done or picture is None or picture.ndim != 3:
         raise ValueError

@@ -1,13 +1,13 @@
-"""Pixels of PNG, JPEG, TIFF, BMP and TGA files exactly as stored, and of RAW files; as linear
-values, and as masks.
+"""Read the pixels of image files exactly as stored, as linear values, or as masks. RAW files are
+developed.
 
-The sizes of images and the memory of captures are checked only here, with the same messages
-everywhere. The check uses the header, before anything is decoded: a file of a few kilobytes may
-state gigabytes of pixels, by mistake or by intent.
+Image sizes and the memory that captures need are checked only here, so that messages are the same
+everywhere. The check uses the header before anything is decoded, because a file of a few kilobytes
+may declare gigabytes of pixels, by mistake or on purpose.
 
-Damaged files are refused. OpenCV fills the missing part of a truncated file with gray and only
-prints to stderr. So the container is checked before it is decoded, and the messages of the C
-libraries are caught and searched.
+Damaged files are rejected. For a truncated file, OpenCV fills the missing part with gray and only
+prints to stderr, so the container is checked before it is decoded, and the messages of the C
+libraries are captured and searched.
 """
 
 import math
@@ -30,11 +30,11 @@ from splinecli.system.machine import LARGEST_IMAGE, available_memory
 
 @dataclass(frozen=True)
 class ExpectedSize:
-    """The size that an image must have."""
+    """The size that an image is expected to have."""
 
     shape: tuple[int, ...]  # (H, W) or (H, W, C)
-    like: str  # whose size it is, for messages, such as the name of the first image
-    what: str = "an image"  # description of the image, with its article
+    like: str  # what else has this size, for messages, such as the name of the first image
+    what: str = "an image"  # description of the image, with an article
 
     def check(self, found: tuple[int, ...], path: Path) -> None:
         """Raise InputError if an image (H, W) or (H, W, C) at `path` has another height or
@@ -51,8 +51,8 @@ class ExpectedSize:
 def check_stored_size(
     shape: tuple[int, ...], item_bytes: int, path: Path, expected: ExpectedSize | None = None
 ) -> None:
-    """Raise InputError if an image (H, W) or (H, W, C) is not of the expected size, has no pixels,
-    or is too large to be read.
+    """Raise InputError if an image (H, W) or (H, W, C) does not have the expected size, has no
+    pixels, or is too large to be read.
     """
     if expected is not None:
         expected.check(shape, path)
@@ -62,10 +62,10 @@ def check_stored_size(
     takes = f"found an image of {_size(shape)} pixels, which takes"
     if n_pixels > LARGEST_IMAGE:
         raise InputError(
-            f"{takes} {n_bytes / 1e9:.1f} GB of memory; expected at most {LARGEST_IMAGE / 1e6:g}"
+            f"{takes} {n_bytes / 1e9:.1f} GB of memory, expected at most {LARGEST_IMAGE / 1e6:g}"
             " megapixels",
             path,
-            hint="If the size is right, use a smaller copy of the image",
+            hint="If the size is correct, use a smaller copy of the image",
         )
     check_memory(n_bytes, takes, path)
 
@@ -78,12 +78,14 @@ def check_vectors(shape: tuple[int, ...], path: Path) -> None:
 
 
 def image_bytes(shape: tuple[int, ...], item_bytes: int) -> int:
-    """Return the bytes that an image takes in memory, as stored and in float32."""
+    """Return the bytes of memory that an image takes as stored and in float32 together."""
     return math.prod(shape) * (item_bytes + 4)
 
 
 def check_memory(n_bytes: int, takes: str, path: Path, *, hint: str | None = None) -> None:
-    """Raise InputError if less memory is available; `takes` is the message's subject and verb."""
+    """Raise InputError if less memory is available. `takes` is the subject and verb of the
+    message.
+    """
     available = available_memory()
     if n_bytes > available:
         raise InputError(
@@ -98,15 +100,15 @@ def _size(shape: tuple[int, ...]) -> str:
 
 
 def common_size(images: Sequence[facts.ImageHeader]) -> facts.StoredSize:
-    """Return the size of the largest of some images.
+    """Return the size of the image that takes the most memory.
 
-    Raises InputError if one differs from the first in height or width, is too large, or has an
+    Raises InputError if an image differs from the first in height or width, is too large, or has an
     incomplete header.
     """
     first = images[0]
     check_stored_size(*first.size, first.path)
     expected = ExpectedSize(first.size[0], first.path.name)
-    # Opening a RAW file is slow, so its size is compared when it is decoded.
+    # Opening a RAW file is slow, so its size is not checked until it is decoded.
     asked = [first, *(image for image in images[1:] if image.kind != "RAW")]
     for image in asked[1:]:
         expected.check(image.size[0], image.path)
@@ -116,24 +118,24 @@ def common_size(images: Sequence[facts.ImageHeader]) -> facts.StoredSize:
 # In a JPEG's scan, FF is followed by 00 (stuffing), D0-D7 (a restart) or FF (fill). Anything else
 # ends the scan.
 _END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
-# Messages of libpng and libjpeg about pixels that they could not read.
+# Messages from libpng and libjpeg about pixels that could not be read
 _DAMAGE = re.compile(
     r"premature end|bad huffman|corrupt jpeg data(?!.*extraneous)|libpng error", re.IGNORECASE
 )
 
 
 def decode_image(path: Path, expected: ExpectedSize | None = None) -> Array:
-    """Return the pixels of an image file as stored: (H, W, C), C 1 or 3 (RGB), without alpha.
+    """Return the pixels (H, W, C) of an image file as stored, without alpha; C is 1 or 3 (RGB).
 
     The dtype is the file's: uint8, uint16, float16, float32 or float64 (bool becomes uint8 0 or
-    255). PNG, JPEG and TIFF files are recognised by their content. RAW files are recognised by name
-    and developed (see decode_raw). An EXIF orientation is ignored, because all images of a capture
+    255). Formats are recognised by their content, except RAW files, which are recognised by name
+    and developed (see decode_raw). The EXIF orientation is ignored, because all images of a capture
     share one pixel grid. The header is compared with the expected size.
 
     Raises:
-        InputError: the file is missing, of another format, truncated or damaged, or a RAW file
-            without rawpy; or the image does not have the expected size, or is too large (see
-            check_stored_size).
+        InputError: the file is missing, truncated, damaged or in an unknown format; it is a RAW
+            file but rawpy is not installed; or the image does not have the expected size or is too
+            large (see check_stored_size).
     """
     return decode_with_alpha(path, expected)[0]
 
@@ -148,8 +150,8 @@ def decode_with_alpha(
     with damage, facts.open_image(path) as (file, kind):
         size = facts.facts_in(file, kind, path).size
         check_stored_size(*size, path, expected)
-        # It is read as a whole, with 64 MB for previews and colour profiles; only its page is read
-        # of a TIFF with many.
+        # The whole file is read, so it is limited, with 64 MB for previews and colour profiles. Of
+        # a TIFF with many pages, only one is read.
         length, most = os.fstat(file.fileno()).st_size, image_bytes(*size) + (1 << 26)
         if length > most and decoders.page_of(path)[0] == path:
             raise InputError(
@@ -169,7 +171,7 @@ def decode_with_alpha(
         pixels = pixels.astype(np.uint8) * np.uint8(255)
     if pixels.dtype not in (np.uint8, np.uint16, np.float16, np.float32, np.float64):
         raise InputError(
-            f"found {pixels.dtype} pixels, expected 8-bit, 16-bit or floating-point ones",
+            f"found {pixels.dtype} pixels, expected 8-bit, 16-bit or floating-point pixels",
             path,
             hint="Save the image with 16 bits",
         )
@@ -179,7 +181,7 @@ def decode_with_alpha(
 
 
 def _decode(file: BinaryIO, kind: str, path: Path) -> Array:
-    """Return the pixels (H, W) or (H, W, C) of an open file of any kind, with alpha."""
+    """Return the pixels (H, W) or (H, W, C) of an open file of any kind, including alpha."""
     if kind == "RAW":
         return decoders.decode_raw(file.read(), path)
     if kind == "MAT":
@@ -213,7 +215,7 @@ def _decode_with_opencv(data: bytes | bytearray) -> Array:
     import cv2
 
     pixels, damaged = _imdecode(data)
-    if damaged:  # perhaps another file, which another thread decoded at the same time
+    if damaged:  # possibly a file that another thread was decoding at the same time
         pixels, damaged = _imdecode(data, alone=True)
     if pixels is None or damaged:
         raise ValueError
@@ -221,21 +223,21 @@ def _decode_with_opencv(data: bytes | bytearray) -> Array:
         return pixels
     if pixels.dtype in (np.uint8, np.uint16, np.float32):
         code = cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
-        # In place, and far faster than an index
+        # Works in place and is far faster than indexing
         return cv2.cvtColor(pixels, code, dst=pixels)
     return pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]]
 
 
 def _imdecode(data: bytes | bytearray, *, alone: bool = False) -> tuple[Array | None, bool]:
-    """Return OpenCV's pixels or None, and whether a decoder reported damage; see native_stderr for
+    """Return OpenCV's pixels or None, and whether a decoder reported damage. See native_stderr for
     `alone`.
     """
     import cv2
 
     with decoders.native_stderr(alone=alone) as messages:
         try:
-            # IMREAD_UNCHANGED keeps 16 bits and the alpha channel, and leaves the EXIF orientation
-            # alone.
+            # IMREAD_UNCHANGED keeps 16 bits and the alpha channel, and ignores the EXIF
+            # orientation.
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         except cv2.error as error:
             if error.code == cv2.Error.StsNoMem:
@@ -245,9 +247,9 @@ def _imdecode(data: bytes | bytearray, *, alone: bool = False) -> tuple[Array | 
 
 
 def _check_png(data: bytes, path: Path) -> None:
-    """Raise InputError unless all chunks up to IEND are complete and have the right checksum."""
+    """Raise InputError unless all chunks up to IEND are complete and have correct checksums."""
     position, view = len(facts.PNG), memoryview(data)
-    for _ in range(10_000 + len(data) // 1024):  # writers make chunks of 8 kB and more
+    for _ in range(10_000 + len(data) // 1024):  # encoders write chunks of at least 8 kB
         if position + 12 > len(data):
             break
         length = int.from_bytes(data[position : position + 4], "big")
@@ -265,7 +267,7 @@ def _check_png(data: bytes, path: Path) -> None:
 
 
 def _check_jpeg(data: bytes, path: Path) -> None:
-    """Raise InputError unless there is an end-of-image marker; a second picture after it is
+    """Raise InputError unless there is an end-of-image marker. A second picture after it is
     ignored.
     """
     position = 2
@@ -277,7 +279,7 @@ def _check_jpeg(data: bytes, path: Path) -> None:
             position += 1
             continue
         position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
-        if marker == 0xDA:  # a scan: the compressed pixels follow its header, without a length
+        if marker == 0xDA:  # a scan: compressed pixels of unknown length follow its header
             following = _END_OF_SCAN.search(data, position)
             if following is None:
                 break
@@ -286,31 +288,30 @@ def _check_jpeg(data: bytes, path: Path) -> None:
 
 
 def read_image(path: StrPath, expected: ExpectedSize | None = None) -> Float32Array:
-    """Return an image (H, W, C) float32, C 1 (gray) or 3 (RGB), whose values are assumed to be
-    linear.
+    """Return an image (H, W, C) float32 whose values are assumed to be linear; C is 1 (gray) or 3
+    (RGB).
 
-    The file is PNG, TIFF or JPEG. 8- and 16-bit values are scaled so that their full scale is 1.
-    Floating-point values are kept. Alpha is dropped, and an EXIF orientation is ignored.
+    8- and 16-bit values are scaled so that full scale becomes 1, and floating-point values are
+    kept. Alpha is dropped, and the EXIF orientation is ignored.
 
     Raises:
-        InputError: see decode_image; also for floating-point values that are negative or not
-            finite.
+        InputError: see decode_image; also if a floating-point value is negative or not finite.
     """
     return to_linear(decode_image(Path(path), expected), Path(path))
 
 
 def to_linear(stored: Array, path: Path) -> Float32Array:
-    """Return stored values of any shape as float32 on the scale of read_image.
+    """Return stored values of any shape as float32, scaled as by read_image.
 
     Raises InputError for a floating-point value that is negative or not finite.
     """
-    with np.errstate(over="ignore"):  # values beyond float32 become infinite, and are refused below
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite and are rejected below
         values = stored.astype(np.float32)
     if stored.dtype.kind == "u":
         values /= np.float32(np.iinfo(stored.dtype).max)
         return values
-    # One of these is NaN or infinite where any value is. np.isfinite of all values would need
-    # another array.
+    # If any value is NaN or infinite, so is one of these. Calling np.isfinite on all values would
+    # take another array.
     lowest, highest = (values.min(), values.max()) if values.size else (0.0, 0.0)
     if not (np.isfinite(lowest) and np.isfinite(highest)):
         raise InputError(
@@ -320,17 +321,17 @@ def to_linear(stored: Array, path: Path) -> Float32Array:
         raise InputError(
             f"found the negative value {lowest:g}, expected a photograph",
             path,
-            hint="Set values below zero, such as noise after a dark frame was subtracted, to zero",
+            hint="Set negative values, for example noise after dark-frame subtraction, to zero",
         )
     return values
 
 
 def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> Bools:
-    """Return a mask (H, W) bool: true where any channel is above half of the image's largest value.
+    """Return a mask (H, W) bool, true where any channel is above half of the image's largest value.
 
-    So masks may use 0 and 1, or 0 and 255. If an alpha channel cuts something out, it alone is the
-    mask, because colours mean nothing in such an image. Raises InputError if the image cannot be
-    read, or no pixel is above zero.
+    Masks may thus use 0 and 1, or 0 and 255. If an alpha channel cuts something out, it alone is
+    the mask, because the colours of such an image are meaningless. Raises InputError if the image
+    cannot be read, or no pixel is above zero.
     """
     path = Path(path)
     stored, alpha = decode_with_alpha(path, expected)
@@ -342,16 +343,15 @@ def read_mask(path: StrPath, expected: ExpectedSize | None = None) -> Bools:
         raise InputError(
             "the mask is empty: every pixel is zero",
             path,
-            hint="Paint the object white, or give no mask",
+            hint="Paint the object white, or omit the mask",
         )
     return np.asarray((stored > stored.max() / 2).any(axis=2))
 
 
 def cut_out(alpha: Array | None) -> Bools | None:
-    """Return the opaque pixels (H, W) of an alpha channel that cuts something out; None for one
-    that does not.
+    """Return the opaque pixels (H, W) of an alpha channel, or None if it cuts nothing out.
 
-    A pixel is opaque above half of the largest alpha. A channel that is opaque everywhere or
+    Pixels above half of the largest alpha are opaque. A channel that is opaque everywhere or
     nowhere cuts nothing out.
     """
     opaque = None if alpha is None else np.asarray(alpha > alpha.max() / 2)

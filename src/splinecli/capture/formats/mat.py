@@ -1,8 +1,7 @@
 """Arrays of real numbers in MATLAB's .mat files of version 5, 6 and 7 (MathWorks, "MAT-File
-Format"), and photographs stored in them.
+Format"), and photographs stored in such arrays.
 
-This reader supports only arrays of real numbers. It exists because SciPy's reader ends the process
-at unknown types.
+This reader exists because SciPy's reader ends the process when it encounters an unknown type.
 """
 
 from __future__ import annotations
@@ -43,7 +42,8 @@ _NUMBERS = {
 }
 _CLASSES = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), start=6))
 """Classes of numeric arrays. MATLAB stores numbers in the smallest type that can represent them, so
-doubles may be stored as bytes."""
+an array of doubles may be stored as bytes.
+"""
 
 
 class Variable(NamedTuple):
@@ -67,10 +67,11 @@ def names(path: Path) -> set[str]:
 
 
 def read_matrix(path: Path, choose: Callable[[dict[str, tuple[int, ...]]], str]) -> Array:
-    """Return a numeric matrix from a small file, whose name is chosen from the shapes by name.
+    """Return the numeric matrix that `choose` selects from a mapping of names to shapes.
 
-    Vectors with numbered names, such as l1 and l2, also form a matrix, with one vector in each row.
-    Only the chosen matrix is decompressed. Raises InputError, including the errors of `choose`.
+    Only small matrices are offered. Vectors with numbered names, such as l1 and l2, also form a
+    matrix, with one vector per row. Only the selected matrix is decompressed. Raises InputError,
+    including the errors of `choose`.
     """
     with damage_as_input_error(path, *_DAMAGED), path.open("rb") as file:
         found = {
@@ -106,7 +107,7 @@ def _numbered(found: Iterable[Variable]) -> dict[tuple[str, tuple[int, ...]], li
 
 
 def numbers_of(file: BinaryIO, variable: Variable) -> Array:
-    """Return the numbers of a variable in their MATLAB type.
+    """Return the array of a variable in its MATLAB type.
 
     Raises KeyError, ValueError, struct.error or zlib.error for a damaged file.
     """
@@ -118,9 +119,9 @@ def numbers_of(file: BinaryIO, variable: Variable) -> Array:
 
 
 def variables(file: BinaryIO, path: Path) -> Iterator[Variable]:
-    """Yield the arrays of real numbers in an open file, without reading their numbers.
+    """Yield the arrays of real numbers in an open file, without reading the numbers.
 
-    Raises InputError for MATLAB 7.3, which is another format, and the errors of numbers_of.
+    Raises InputError for MATLAB 7.3, which is a different format, and the errors of numbers_of.
     """
     header = file.read(128)
     if header.startswith(b"MATLAB 7.3"):
@@ -136,7 +137,7 @@ def variables(file: BinaryIO, path: Path) -> Iterator[Variable]:
         kind, length = struct.unpack(order + "II", tag)
         start, compressed = file.tell(), kind == _COMPRESSED
         if kind in (_COMPRESSED, _MATRIX):
-            # 4096 bytes are enough for the sizes and the name.
+            # The first 4096 bytes contain the sizes and the name.
             parts = _parts(_read(file, start, length, 1 << 12, compressed=compressed), order)
             (flags, *_) = struct.unpack(order + "II", next(parts)[1])
             if flags & 0xFF in _CLASSES and not flags & (1 << 11):  # the flag of complex numbers
@@ -167,7 +168,7 @@ def _parts(content: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
     place = 0
     while place + _TAG_BYTES <= len(content):
         kind, length = struct.unpack_from(order + "II", content, place)
-        if kind >> 16:  # up to four bytes are stored in the tag
+        if kind >> 16:  # up to four bytes of data are stored in the tag itself
             yield kind & 0xFFFF, content[place + 4 : place + 4 + (kind >> 16)]
             length = 0
         else:
@@ -178,17 +179,17 @@ def _parts(content: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
 _PICTURES = ("i", "im", "ims", "img", "imgs", "image", "images", "photos", "stack", "data")
 _MASKS = ("mask", "m", "msk")
 _MOST_FILES = 4  # number of files whose contents are cached
-_MOST_PICTURES = 9_999  # the largest number that page_of reads
+_MOST_PICTURES = 9_999  # the largest number that page_of accepts
 
 
 @dataclass(frozen=True)
 class Stack:
     """The photographs in a .mat file, and their mask.
 
-    The axes of each array are letters: F images, H rows, W columns and C channels.
+    Letters stand for the axes of each array: F images, H rows, W columns and C channels.
     """
 
-    arrays: tuple[Variable, ...]  # one array for all photographs, or one for each
+    arrays: tuple[Variable, ...]  # one array for all photographs, or one for each of them
     axes: str  # such as "HWF", or "HW" if each photograph is a separate array
     mask: Variable | None
 
@@ -207,10 +208,10 @@ class Stack:
 
 
 def find_stack(path: Path) -> Stack | None:
-    """Return the photographs in a .mat file, without reading them; None if there are none.
+    """Return the photographs in a .mat file without reading them, or None if there are none.
 
-    They are one array H x W x F or H x W x C x F, an array with F first as NumPy's users save it,
-    or several arrays with numbered names. Among several possible arrays, one with a usual name is
+    They form one array H x W x F or H x W x C x F, an array with F first, as is usual with NumPy,
+    or several arrays with numbered names. If several arrays are possible, one with a usual name is
     chosen. Raises InputError.
     """
     with reading(path):
@@ -225,11 +226,11 @@ def _find_stack(path: Path, *_: int) -> Stack | None:
     counts = {n for v in found if len(v.shape) == 2 and 3 in v.shape for n in v.shape}
     masks = [v for v in found if len(v.shape) == 2 and v.name.lower() in _MASKS]
     size = masks[0].shape if len(masks) == 1 else None
-    stacks: list[tuple[bool, Stack]] = []  # true for a stack with an unusual name
+    stacks: list[tuple[bool, Stack]] = []  # true if the name is unusual
     for variable in found:
         axes = _axes(variable.shape, counts, size)
         usual = variable.name.lower() in _PICTURES
-        if axes is not None and (usual or variable.shape[2:] != (3,)):  # for example normals
+        if axes is not None and (usual or variable.shape[2:] != (3,)):  # may be normals
             stacks.append((not usual, Stack((variable,), axes, None)))
     for key, group in _numbered(found).items():
         shape = key[1]
@@ -244,11 +245,9 @@ def _find_stack(path: Path, *_: int) -> Stack | None:
 
 
 def _axes(shape: tuple[int, ...], counts: set[int], size: tuple[int, ...] | None) -> str | None:
-    """Return the axes of an array of photographs; None for any other array.
+    """Return the axes of an array of photographs, or None for any other array.
 
-    Args:
-        counts: possible numbers of lights.
-        size: the mask's (H, W), or None.
+    Args: counts: possible numbers of lights. size: the mask's (H, W), or None.
     """
     possible = ["HWF", "FHW"] if len(shape) == 3 else []
     if len(shape) == 4:
@@ -261,12 +260,11 @@ def _axes(shape: tuple[int, ...], counts: set[int], size: tuple[int, ...] | None
         is_size = size == (sizes["H"], sizes["W"])
         return is_size, sizes["F"] in counts, sizes["F"] < min(sizes["H"], sizes["W"])
 
-    return max(possible, key=fit)  # the first one if several fit equally well
+    return max(possible, key=fit)  # the first one if several fit equally
 
 
 def picture_size(path: Path) -> tuple[tuple[int, ...], int]:
-    """Return the shape (H, W, C) of a photograph or mask in a .mat file, and the bytes of each
-    number.
+    """Return the shape (H, W, C) of a photograph or mask in a .mat file, and the bytes per value.
 
     The path ends with its place in the file, as in a.mat[0] or a.mat[mask]. Raises InputError.
     """
@@ -277,7 +275,7 @@ def picture_size(path: Path) -> tuple[tuple[int, ...], int]:
 
 
 def stack_bytes(path: Path) -> int:
-    """Return the memory in bytes for reading a photograph, which requires the whole array.
+    """Return the memory in bytes that reading a photograph takes, which requires the whole array.
 
     Raises InputError.
     """
@@ -298,8 +296,8 @@ def read_picture(path: Path) -> Array:
 
 
 def _place(path: Path) -> tuple[Stack, int, tuple[Variable, ...]]:
-    """Return the stack, the number of a picture in it, and the arrays starting with the picture's
-    own.
+    """Return the stack, the number of a picture in it, and the arrays from the picture's own array
+    on.
     """
     stored, number = page_of(path)
     stack = find_stack(stored)
@@ -313,7 +311,7 @@ def _place(path: Path) -> tuple[Stack, int, tuple[Variable, ...]]:
     return stack, number, arrays
 
 
-@lru_cache(1)  # a compressed array would otherwise be decompressed for each photograph
+@lru_cache(1)  # otherwise, a compressed array would be decompressed for each photograph
 def _read_array(path: Path, variable: Variable, *_: int) -> Array:
     with damage_as_input_error(path, *_DAMAGED), path.open("rb") as file:
         return numbers_of(file, variable)

@@ -1,12 +1,12 @@
-"""Normal maps and ground truth from .mat, .npy, text and picture files; depth maps, for example
-from scanners.
+"""Read normal maps and ground truth from .mat, .npy, text and picture files, and depth maps, for
+example from scanners.
 
 Frame: x right, y up, z to the camera. A file is one of
 
 - MATLAB .mat, with the array Normal_gt or a single H x W x 3 array, or .npy. Unsigned integers are
-  treated as colours of a picture;
+  treated as the colours of a picture;
 - .txt, for ground truth only, with H*W rows of x y z in row-major order;
-- a picture with n = 2 v / full scale - 1, black or mid-gray where there is no normal; a
+- a picture with n = 2 v / full scale - 1 that is black or mid-gray where there is no normal; a
   floating-point TIFF contains n itself.
 
 Vectors are scaled to unit length; zero and non-finite vectors are treated as missing. Depth maps
@@ -37,15 +37,15 @@ from splinecli.maths.pixel_grid import slices
 from splinecli.system.files import StrPath, check_file, utf8_name
 from splinecli.system.machine import import_extra
 
-_LARGEST = 1e100  # the squares of larger values, in damaged files, may be infinite
+_LARGEST = 1e100  # squares of larger values, which occur in damaged files, may overflow
 _MOST_CHANNELS = 256  # in an EXR file; renderers write up to about a hundred
-_BLOCK = 1 << 20  # pixels scaled at a time, because a large picture in float64 needs much memory
+_BLOCK = 1 << 20  # pixels scaled at a time, because float64 takes much memory
 
 
 class _Stored(NamedTuple):
-    """Vectors in the form in which a file stores them."""
+    """Vectors as stored in a file."""
 
-    values: Array  # (H, W, 3); in a picture, these are colours with n = 2 v / full scale - 1
+    values: Array  # (H, W, 3); of a picture, colours v with n = 2 v / full scale - 1
     alpha: Array | None  # (H, W), the alpha channel of a picture
     is_picture: bool
 
@@ -53,22 +53,22 @@ class _Stored(NamedTuple):
 def read_normal_map(
     path: StrPath, mask: Bools | Path | None = None, *, convention: Convention = "opengl"
 ) -> Float32Array:
-    """Return a normal map (H, W, 3) float32 of any size: unit vectors with y up, zero without a
-    normal.
+    """Return a normal map (H, W, 3) float32 of any size: unit vectors with y up, or zero where
+    there is no normal.
 
-    Raises InputError if the file cannot be read, contains no normal map, or does not have the size
-    of the mask.
+    Raises InputError if the file cannot be read, does not contain a normal map, or differs from the
+    mask in size.
 
     Args:
         path: any of the files above except text.
-        mask: (H, W), True at the pixels whose normals are read; or a mask image. Transparent pixels
-            of a picture are also left out.
+        mask: (H, W), True at the pixels whose normals are read; or the path of a mask image.
+            Transparent pixels of a picture are also excluded.
         convention: whether green points up ("opengl") or down ("directx") in a picture.
     """
     path = Path(path)
     expected = None
     if mask is not None:
-        # Both headers are compared before either file is decoded.
+        # The sizes in both headers are compared before either file is decoded.
         shape = read_header(mask).size[0] if isinstance(mask, Path) else mask.shape
         expected = images.ExpectedSize(shape, "the mask", "a normal map")
     stored = _read_vectors(path, expected)
@@ -85,16 +85,16 @@ def read_normal_map(
 
 
 def read_ground_truth(path: StrPath, mask: Bools) -> tuple[Float32Array, bool]:
-    """Return ground truth (H, W, 3) float32, and whether it was flipped vertically.
+    """Return ground-truth normals (H, W, 3) float32, and whether they were flipped vertically.
 
     Vectors have unit length, or are zero outside the mask and in pixels without ground truth. A
-    text file is flipped vertically if it then fits the mask clearly better, as with the normal.txt
-    of DiLiGenT's Harvest. Raises InputError if the file cannot be read, has another size, or
-    contains no normal inside the mask.
+    text file is flipped vertically if it then fits the mask clearly better, as the normal.txt of
+    DiLiGenT's Harvest does. Raises InputError if the file cannot be read, differs from the mask in
+    size, or contains no normal inside the mask.
 
     Args:
-        path: any of the files above; pictures only as PNG, TIFF or BMP.
-        mask: (H, W), of the size of the images, True at the pixels whose normals are read.
+        path: any of the files above, but pictures only as PNG, TIFF or BMP.
+        mask: (H, W), with the size of the images, True at the pixels whose normals are read.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -129,9 +129,9 @@ def _read_vectors(path: Path, expected: images.ExpectedSize | None) -> _Stored:
             values = read_mat(path, expected)
     elif suffix == ".npy":
         with damage_as_input_error(
-            path, "the .npy file is damaged, or contains no array of numbers"
+            path, "the .npy file is damaged or does not contain an array of numbers"
         ):
-            # Mapping the file only reads the header. A file that is too short is rejected.
+            # Memory-mapping reads only the header, and rejects a file that is too short.
             array = np.lib.format.open_memmap(path, mode="r")
             images.check_vectors(array.shape, path)
             images.check_stored_size(array.shape, array.dtype.itemsize, path, expected)
@@ -149,11 +149,9 @@ def _read_vectors(path: Path, expected: images.ExpectedSize | None) -> _Stored:
 def read_mat(path: Path, expected: images.ExpectedSize | None) -> Array:
     """Return the array Normal_gt of a file, or its only H x W x 3 array, in its MATLAB type.
 
-    Sizes are checked before anything is read or decompressed.
-
-    Raises:
-        InputError: the array is missing, too large or not of the expected size. KeyError,
-            ValueError, struct.error, zlib.error: the file is damaged.
+    Sizes are checked before anything is read or decompressed. InputError: the array is missing, too
+    large or not of the expected size. KeyError, ValueError, struct.error, zlib.error: the file is
+    damaged.
     """
     with path.open("rb") as file:
         variables = list(mat.variables(file, path))
@@ -173,14 +171,14 @@ def read_mat(path: Path, expected: images.ExpectedSize | None) -> Array:
 
 
 def _read_text(path: Path, height: int, width: int) -> Float64Array:
-    """Return vectors (H, W, 3), one on each line. Raises InputError."""
-    # At most 32 characters for each number, with the separator after it
+    """Return vectors (H, W, 3) from a file with one vector per line. Raises InputError."""
+    # At most 32 characters per number, including the separator after it
     most = 3 * height * width * 32 + MOST_TEXT
     check_text_length(path, most, "a normal map")
     try:
         rows = np.loadtxt(path, np.float64, ndmin=2, encoding="utf-8-sig")
     except (ValueError, OSError):
-        # This reader is slower, but it reads commas and names the line of an error.
+        # This reader is slower, but it accepts commas and names the line of an error.
         rows = read_number_rows(path, most=most).as_array()
     if rows.shape != (height * width, 3):
         problem = (
@@ -195,8 +193,8 @@ def _to_normals(
 ) -> Float32Array:
     """Return unit vectors (H, W, 3), zero outside the mask (H, W).
 
-    As vectors, colours must have about unit length, and with check_floats also floating-point
-    values. Raises InputError for values that are not normals.
+    Colours must decode to vectors of about unit length, and with check_floats, floating-point
+    values must also have about unit length. Raises InputError for values that are not normals.
     """
     values = stored.values
     if values.dtype.kind not in "fiu":
@@ -227,12 +225,12 @@ def _check_lengths(stored: Array, mask: Bools, path: Path) -> None:
     if stored.dtype.kind == "u":
         vectors = vectors * (2 / np.iinfo(stored.dtype).max) - 1
     length = np.linalg.norm(vectors[(np.abs(vectors) < _LARGEST).all(axis=1)], axis=1)
-    # Half of a picture may be gray background, whose length is 0.
+    # Half of a picture may be a gray background, whose vectors have length 0.
     usable = length > SHORTEST_IN_PICTURE if stored.dtype.kind == "u" else length > 0
     if not usable.any():
         return
-    # Rounding to 8 bits, resizing and JPEG change the length of unit vectors. In photographs, a
-    # third of the colours have unit length by chance.
+    # Rounding to 8 bits, resizing and JPEG compression change the length of unit vectors. In
+    # photographs, a third of the colours have unit length by chance.
     share = float((np.abs(length[usable] - 1) < 0.1).mean())
     if share < 0.6:
         raise InputError(
@@ -244,13 +242,12 @@ def _check_lengths(stored: Array, mask: Bools, path: Path) -> None:
 
 
 def read_depth(path: Path, expected: images.ExpectedSize) -> Float64Array:
-    """Return a depth map (H, W) float64, with NaN where the depth is unknown because it is not
-    finite.
+    """Return a depth map (H, W) float64, with NaN where the stored depth is not finite.
 
     Raises:
-        InputError: the file cannot be read, is not a map of floating-point numbers, or has another
-            size.
-        UsageError: the file is an EXR file, and OpenEXR is not installed.
+        InputError: the file cannot be read, is not a map of floating-point numbers, or does not
+            have the expected size.
+        UsageError: the file is an EXR file, but OpenEXR is not installed.
     """
     check_file(path, "a depth map")
     suffix = path.suffix.lower()
@@ -275,7 +272,7 @@ def read_depth(path: Path, expected: images.ExpectedSize) -> Float64Array:
 
 
 def _exr_size(header: Mapping[str, Any]) -> tuple[int, int]:
-    """Return height and width of a part of an EXR file."""
+    """Return the height and width of a part of an EXR file."""
     low, high = header["dataWindow"]
     return int(high[1] - low[1] + 1), int(high[0] - low[0] + 1)
 
@@ -290,16 +287,16 @@ def _read_exr(path: Path, expected: images.ExpectedSize) -> Array:
         # The library reads all channels of all parts.
         sizes = [(*_exr_size(header), len(header["channels"])) for header in headers]
         (height, width, _), n_values = sizes[0], sum(map(math.prod, sizes))
-        n_channels = -(-n_values // (height * width))  # or parts of their size
+        n_channels = -(-n_values // (height * width))  # or parts of this size
         images.check_stored_size((height, width, n_channels), 4, path, expected)
         if n_channels > _MOST_CHANNELS:
             raise InputError(
                 f"found {n_channels} channels, expected at most {_MOST_CHANNELS}",
                 path,
-                hint="Save the depth alone",
+                hint="Save only the depth channel",
             )
-        # For damaged pixels, the library only prints a warning. stdout is reserved for the product
-        # of a command.
+        # If pixels are damaged, the library only prints a warning. It must not reach stdout, which
+        # is reserved for results.
         with redirect_stdout(io.StringIO()) as printed, native_stderr():
             channels = library.File(name).channels()
     if printed.getvalue():
@@ -308,4 +305,4 @@ def _read_exr(path: Path, expected: images.ExpectedSize) -> Array:
     for channel in ("Z", "Y", "R", "V", "depth.Z", "RGB", "RGBA", *channels):
         if channel in channels:
             return np.asarray(channels[channel].pixels)
-    raise InputError("the EXR file has no channel", path)
+    raise InputError("the EXR file has no channels", path)

@@ -1,4 +1,4 @@
-"""Numbers in text files, with any separator, byte order marks, comments and blank lines."""
+"""Read numbers from text files with any separator, byte order marks, comments and blank lines."""
 
 import codecs
 import re
@@ -20,19 +20,20 @@ _NUMBER_WITH_COMMA = re.compile(r"(?=\D*\d)[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
 
 _FROM_PIPES: dict[Path, bytes] = {}
 
-# The line number of a row, counted from one, its text without comments, and its words
+# A row's one-based line number, its text without comments, and its words
 WordRow = tuple[int, str, list[str]]
 
 MOST_TEXT = 1_000_000
-"""Size limit of text files in bytes, enough for 14,000 lights, if the number of images is unknown.
+"""Size limit of text files in bytes if the number of images is unknown; enough for 14,000
+lights.
 """
 
 # Hint for a line with decimal commas
-DECIMAL_POINT = "A comma separates columns; write decimals with a point"
+DECIMAL_POINT = "Commas separate columns, so use a point as the decimal separator"
 
 
 class NumberRow(NamedTuple):
-    """A row of numbers, its line number counted from one, and its text without comments."""
+    """A row of numbers, its one-based line number, and its text without comments."""
 
     numbers: tuple[float, ...]
     line: int | None  # None in a file without lines, such as JSON
@@ -41,21 +42,21 @@ class NumberRow(NamedTuple):
 
 @dataclass(frozen=True)
 class NumberRows:
-    """The rows of numbers in a text file. There is at least one; all are finite; their lengths may
-    differ.
+    """The rows of numbers in a text file. There is at least one row. All numbers are finite, and
+    rows may differ in length.
     """
 
     path: Path
     rows: tuple[NumberRow, ...] = field(repr=False)
-    # names of the rows' images, without folders; None if rows begin with numbers
+    # image names of the rows, without folders; None if rows begin with numbers
     names: tuple[str, ...] | None = None
     intensities: Float64Array | None = None  # (R, 3) RGB light intensities, if the file has them
     # whether each row is a vector x y z, because the format has no other rows
     are_vectors: bool = False
 
     def as_array(self) -> Float64Array:
-        """Return the rows as (R, C) float64. Raises InputError for the first row of another
-        length.
+        """Return the rows as an array (R, C) float64. Raises InputError for the first row whose
+        length differs.
         """
         lengths = [len(row.numbers) for row in self.rows]
         usual = 3 if 3 in lengths and lengths.count(3) * 2 >= len(lengths) else lengths[0]
@@ -82,7 +83,7 @@ def has_decimal_commas(text: str) -> bool:
 
 
 def check_text_length(path: Path, most: int, expected: str = "a text file") -> None:
-    """Raise InputError for a text file of more than `most` bytes, and for a path that is not a
+    """Raise InputError for a text file longer than `most` bytes, and for a path that is not a
     file.
     """
     check_file(path, expected)
@@ -97,9 +98,9 @@ def check_text_length(path: Path, most: int, expected: str = "a text file") -> N
 def read_text(path: Path, *, most: int = MOST_TEXT, expected: str = "a text file") -> bytes:
     """Return the bytes of a text file, or of a pipe such as the shell's `<(...)`.
 
-    The content of a pipe is kept, because it can be read only once. Raises InputError if the file
-    is missing, not a file, or longer than `most` bytes. Messages describe the expected content as
-    `expected`.
+    The content of a pipe is cached, because it can be read only once. Raises InputError if the path
+    does not exist, is not a file, or has more than `most` bytes. `expected` describes the expected
+    content in messages.
     """
     check_file(path, expected, pipe=True)
     with reading(path):
@@ -123,8 +124,8 @@ def read_lines(
 ) -> list[str]:
     """Return the lines of a file in UTF-8, or in UTF-16 with a byte order mark. Raises InputError.
 
-    With else_latin_1, a file that is not UTF-8 is read as Latin-1, which older Windows programs
-    write. For the other arguments, see read_text.
+    With else_latin_1, a file that is not UTF-8 is read as Latin-1, as written by older Windows
+    programs. For the other arguments, see read_text.
     """
     content = read_text(path, most=most, expected=expected)
     is_utf_16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
@@ -139,7 +140,7 @@ def read_lines(
             ) from None
         text = content.decode("latin-1")
     lines = re.split(r"\r\n|\r|\n", text)
-    if len(lines) > most // 20:  # 20 bytes for each line, because lines take time and memory
+    if len(lines) > most // 20:  # 20 bytes per line, because lines take time and memory
         raise InputError(f"found {len(lines)} lines, expected at most {most // 20}", path)
     return lines
 
@@ -147,11 +148,11 @@ def read_lines(
 def read_number_rows(
     path: Path, *, expected: str = "a text file", most: int = MOST_TEXT
 ) -> NumberRows:
-    """Return numbers separated by spaces, tabs, commas or semicolons, without "#" comments and
-    blank lines.
+    """Return the rows of numbers in a text file, without "#" comments and blank lines.
 
-    For the arguments, see read_text. Raises InputError with the line for a word that is not a
-    finite number, and for a file without numbers.
+    Numbers are separated by spaces, tabs, commas or semicolons. For the arguments, see read_text.
+    Raises InputError with the line for a word that is not a finite number, and for a file without
+    numbers.
     """
     return parse_rows(read_rows_of_words(path, 3, expected=expected, most=most), path)
 
@@ -159,8 +160,7 @@ def read_number_rows(
 def read_rows_of_words(
     path: Path, n_numbers: int, *, expected: str, most: int = MOST_TEXT
 ) -> list[WordRow]:
-    """Return the words of each line that is not empty, with decimal points instead of decimal
-    commas.
+    """Return the words of each non-empty line, with decimal commas converted to points.
 
     Each line ends with n_numbers numbers. For the other arguments, see read_text. Raises
     InputError.
@@ -168,7 +168,7 @@ def read_rows_of_words(
     stored = enumerate(read_lines(path, expected=expected, most=most), start=1)
     content = [(line, text.partition("#")[0].strip()) for line, text in stored]
     content = [(line, text) for line, text in content if text.strip(" ,;")]
-    if content and content[0][1][0] in "[(":  # a list as Python or NumPy prints it
+    if content and content[0][1][0] in "[(":  # a list as printed by Python or NumPy
         parts = [(line, part) for line, text in content for part in re.split(r"[\])]", text)]
         content = [(line, text) for line, part in parts if (text := part.strip(" \t,;[("))]
     commas = uses_decimal_commas([text for _, text in content], n_numbers)
@@ -178,7 +178,7 @@ def read_rows_of_words(
 def parse_rows(rows: Sequence[WordRow], path: Path) -> NumberRows:
     """Return the numbers in rows of words.
 
-    Raises InputError with the line for other words, and for an empty list.
+    Raises InputError, with the line, for a word that is not a finite number, and for an empty list.
     """
     if not rows:
         raise InputError("the file contains no numbers", path)
@@ -190,7 +190,7 @@ def parse_rows(rows: Sequence[WordRow], path: Path) -> NumberRows:
 
 
 def split_words(text: str, *, decimal_commas: bool = False) -> list[str]:
-    """Return the words of a line, with decimal points instead of decimal commas."""
+    """Return the words of a line, with decimal commas converted to points."""
     separators = _SEPARATORS_BESIDE_COMMAS if decimal_commas else _SEPARATORS
     words = [word for word in separators.split(text) if word]
     if decimal_commas:
@@ -209,16 +209,18 @@ def uses_decimal_commas(texts: Sequence[str], n_numbers: int) -> bool:
 
 
 def to_number(word: str) -> float | None:
-    """Return the number that a word represents, finite or not; None for any other word."""
+    """Return the number that a word represents, which may not be finite, or None for any other
+    word.
+    """
     try:
-        # float() also accepts "1_000", but "2024_01" is the name of an image.
+        # float() also accepts "1_000", but "2024_01" may be the name of an image.
         return float(word) if "_" not in word else None
     except ValueError:
         return None
 
 
 def parse_number(word: str, path: Path, line: int) -> float:
-    """Return the finite number that a word represents. Raises InputError with the line for other
+    """Return the finite number that a word represents. Raises InputError, with the line, for other
     words.
     """
     value = to_number(word)
