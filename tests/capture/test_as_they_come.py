@@ -242,7 +242,7 @@ def test_one_bad_light_is_left_out(folder, vector):
     assert check(source) == ["images_left_out"]
     assert str(source.warnings[0]).startswith("004.png (z = ") and source.n_lights == 11
     assert source.places_of([0, 3, 5, 11]) == [0, 3, 4, 10]
-    with refuses(r"light 4 was left out", UsageError):
+    with refuses(r"light 4 cannot be chosen, because it was left out", UsageError):
         source.places_of([0, 1, 4])
     put(folder / "light_directions.txt", "\n".join([*lines[:-1], vector]))
     assert "2 of 12 images were left out" in str(open_capture(folder).warnings[0])

@@ -44,7 +44,7 @@ def test_identical_lights(tmp_path, light, as_stored, rng):
         shading = np.linspace(0.1, 1, 900).reshape(30, 30) * rng.uniform(0.5, 1.5)
         write_image(tmp_path / f"{number}.png", to_uint16(shading * 40_000))
     np.savetxt(tmp_path / "lights.txt", [light] * 8)
-    with refuses("the 8 lights are in one plane"):
+    with refuses("the 8 lights are coplanar"):
         read_capture(tmp_path, as_stored=as_stored)
 
 

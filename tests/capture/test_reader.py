@@ -176,7 +176,7 @@ def test_positions_given_as_directions_are_named(tmp_path, scale, spread, warned
     found = [str(w) for w in read_capture(folder).warnings if w.code == "near_lamps"]
     assert len(found) == warned
     if warned:
-        assert "lengths from 200 to 260" in found[0] and "--light-positions" in found[0]
+        assert "from 200 to 260" in found[0] and "--light-positions" in found[0]
 
 
 MASK = np.array([[True, False, True], [True, True, False]])

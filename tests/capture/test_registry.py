@@ -91,7 +91,7 @@ def test_folders_that_are_no_capture(tmp_path):
         (
             "dataset",
             Overrides(),
-            r"no images\. Pass one of the captures in .*dataset, such as .*a\.",
+            r"no images\. Pass one of the captures inside .*dataset, such as .*a\.",
         ),
         (
             "dark",

@@ -92,7 +92,7 @@ def test_results_are_a_part_of_those_of_the_whole(crop, scale, tmp_path):
 def test_windows_in_words():
     assert (
         parse_window(*WINDOWS[2]).in_words()
-        == "50 x 47 pixels from (31, 22), one of 4 rows and columns"
+        == "50 x 47 pixels from (31, 22), one in 4 rows and columns"
     )
     assert describe_capture(InfoOptions(capture=MEDALLION))["reads"] is None
 
@@ -100,10 +100,10 @@ def test_windows_in_words():
 @parametrize(
     "crop, scale, problem",
     [
-        ("1,2,3", None, "--crop is '1,2,3'; expected X,Y,W,H"),
+        ("1,2,3", None, "--crop is '1,2,3', expected X,Y,W,H"),
         ("-1,0,5,5", None, "--crop is"),
         ("0,0,0,5", None, "--crop is"),
-        (None, "4", "--scale is '4'; expected 1/N"),
+        (None, "4", "--scale is '4', expected 1/N"),
         (None, "1/0", "--scale is"),
         (None, "0.5", "--scale is"),
     ],

@@ -199,7 +199,7 @@ def test_films_that_cannot_be_used(run):
         (
             3,
             f"{film} --lights estimate",
-            "clip.avi: found 1 of 10 frames that are sharp and under different lights",
+            "clip.avi: only 1 of 10 frames are sharp and under different lights",
         ),
         (3, "none.mp4 --lights estimate", "the video does not exist"),
         # a name that would lead out of OUT/frames is none of a film

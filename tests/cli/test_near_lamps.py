@@ -105,7 +105,7 @@ REFUSED = """
 --light-positions l.txt --lights l.txt | 2 | cannot be used together
 --light-positions missing.txt | 3 | missing.txt: the file does not exist
 --light-positions l.txt | 3 | the scale of the lamp positions is unknown
---light-positions l.txt --pixel-size 1 --light-format azel | 2 | concerns light directions
+--light-positions l.txt --pixel-size 1 --light-format azel | 2 | applies to light directions
 """
 
 

@@ -102,7 +102,7 @@ def test_a_large_capture_with_few_lit_pixels_is_left_to_the_network():
     """Without a mask, most pixels are a black background."""
     dark = capture(AUTOMATIC_FROM)
     dark.observations[100:] = 0
-    with refuses("matte: 100 pixels are lit, too few to distil", UsageError):
+    with refuses("matte: only 100 pixels are lit, which is too few to distil", UsageError):
         distil_for(dark, Slow(), True)
     assert distil_for(dark, Slow(), None) == (None, [])
 

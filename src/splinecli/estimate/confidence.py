@@ -1,8 +1,8 @@
 """Correct the errors that a network predicts, using residuals of the whole capture.
 
 A single pixel does not allow wrong lights or values to be distinguished from an unusual
-reflectance. Many pixels do: errors of calibration follow the lights, the place in the image, or the
-brightness in the same way everywhere.
+reflectance. Many pixels do: calibration errors depend on the lights, the position in the image, or
+the brightness in the same way everywhere.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from splinecli.maths.pixel_grid import Blocks
 from splinecli.maths.robust import absolute_weights, fit_robustly, fit_scaled_normals
 from splinecli.system.machine import side_by_side
 
-# with fewer, the residuals of a fit are not enough to assess a capture
+# with fewer, the residuals of a fit do not suffice to assess a capture
 _FEWEST_LIGHTS, _FEWEST_PIXELS = 5, 50
 _FITS = 4
 _LEAST_SHARE, _LEAST_DEG = 1e-3, 0.1  # added before a logarithm is taken
@@ -34,12 +34,12 @@ def correct_errors(
     normals: Float32Array,
     errors: Float32Array,
 ) -> bool:
-    """Correct the distributions of errors (P, 2) of normals (P, 3) in place; return whether that
+    """Correct the distributions of errors (P, 2) of normals (P, 3) in place; return whether this
     was possible.
 
-    It is impossible if the capture is too small, or if the correction was not made for the
-    estimator's weights. A pixel that is dark under every light is left unchanged. `lighting_at`
-    returns the light of given pixels.
+    It is impossible if the capture is too small, or if there is no correction for the estimator's
+    weights. Pixels that are black under every light are left unchanged. `lighting_at` returns the
+    light of given pixels.
     """
     import torch
 
@@ -70,49 +70,51 @@ def correct_errors(
 def add_common_error(errors: Float32Array, error_deg: float) -> None:
     """Widen distributions of errors (P, 2) in place by an error in degrees that all normals share.
 
-    Wrong lights or values rotate the normals together. The medians of both errors are added like
-    the medians of independent errors, and the shape approaches the shape of the common error where
-    that error is the larger one.
+    Wrong lights or values rotate all normals together. The medians of both errors are added in
+    quadrature, as for independent errors, and the shape approaches the shape of the common error if
+    that error is larger.
     """
     own = 2 * errors[:, 0]
     errors[:, 0] = np.logaddexp(own, 2 * np.log(np.radians(error_deg))) / 2
     share = -np.expm1(own - 2 * errors[:, 0])
-    # The shape of an error that all normals share: four of five are within a factor of 1.6.
+    # The shape of an error that all normals share, which for four out of five is within a factor of
+    # 1.6.
     errors[:, 1] += share * (np.log(3.5) - errors[:, 1])
 
 
 class CaptureFeatures(NamedTuple):
-    """Numbers that describe how well a capture fits the assumptions. NaN is unknown.
+    """Numbers that describe how well a capture satisfies the assumptions; NaN if unknown.
 
-    Misfits are logs of a matte surface's residuals, as a share of the brightness and a median over
-    pixels; a turn is the log of the median angle in degrees by which normals would rotate.
+    A misfit is the logarithm of a matte surface's residual relative to the brightness, as a median
+    over pixels. A turn is the logarithm of the median angle in degrees by which normals would
+    rotate.
     """
 
-    misfit: float  # with the estimated normals
-    free_misfit: float  # with those that fit best
-    # log of the residual of all images after the best fit of three free images to this capture
+    misfit: float  # for the estimated normals
+    free_misfit: float  # for the best-fitting normals
+    # log of the residual of all images after the best fit of rank 3
     rank_residual: float
-    light_misfit: float  # log of how far the lights are from those three
-    free_light_misfit: float  # the same with any intensities
+    light_misfit: float  # log of the distance of the lights from the lights of this fit
+    free_light_misfit: float  # the same for arbitrary intensities
     # log of the share of the residual that remains after decoding the values once more
     decoding: float
-    # of lamps as near as they appear in the images: the width of the object over their distance
+    # width of the object over the distance of the lamps that the residuals indicate
     nearness: float
-    near_share: float  # the share of the residual that it explains
+    near_share: float  # share of the residual that near lamps explain
     near_turn: float
-    # the log of an exponent of the values; it rotates normals only below 1, as encoded values have
+    # log of the exponent of the values that the residuals indicate; it rotates normals only below
+    # 1, as for encoded values
     bend: float
     bend_share: float
     bend_turn: float
-    curl: float  # log of the curl of the normals over their derivatives
-    # |cosine| between normals and the outward direction at a steep outline: 1 for a ball and for a
-    # bowl
+    curl: float  # log of the ratio between the curl of the normals and their derivatives
+    # |cosine| between normals and the outward direction at a steep outline; 1 for a ball or a bowl
     rim: float
-    lights: float  # log of their number
-    spread: float  # how well they determine a normal
-    # log of the median angle in degrees between the estimated normals and those that fit best
+    lights: float  # log of the number of lights
+    spread: float  # how well the lights determine a normal
+    # log of the median angle in degrees between the estimated and the best-fitting normals
     difference: float
-    expected: float  # mean logarithm of the expected errors
+    expected: float  # mean logarithm of the predicted errors
     shadow: float  # share of shadowed observations
     dark: float  # share of dark pixels
 
@@ -124,14 +126,14 @@ class PixelScale:
     bright: float  # brightness of a bright pixel
     middle: tuple[float, float]  # row and column of the middle of the object
     width: float  # of the object, in pixels
-    # (3, 3, 2), the rotation of a normal by near lamps, over the normal and the place
+    # (3, 3, 2), the linear map from a normal and its place to the normal's rotation by near lamps
     turning: Float64Array
 
     def features(
         self, brightness: Floats, normals: Floats, rows: Integers, columns: Integers
     ) -> Float64Array:
-        """Return for pixels (n, 2): log of their relative brightness, and of the rotation by near
-        lamps in degrees.
+        """Return the features (n, 2) of pixels: the logarithms of their relative brightness, and of
+        their rotation by near lamps in degrees.
         """
         turn_deg: Floats = np.zeros(len(normals))
         if self.turning.any():
@@ -143,7 +145,9 @@ class PixelScale:
         return np.stack((np.log(brightness / self.bright + 1e-3), np.log(turn_deg + 0.3)), axis=1)
 
     def places(self, rows: Integers, columns: Integers) -> Float64Array:
-        """Return places (n, 2) from the middle of the object, x right and y up, in its widths."""
+        """Return places (n, 2) relative to the middle of the object, x right and y up, in widths of
+        the object.
+        """
         return np.stack((columns - self.middle[1], self.middle[0] - rows), axis=1) / self.width
 
 
@@ -154,11 +158,11 @@ def capture_features(
     errors: Float32Array,
     lights: Float64Array,
 ) -> tuple[CaptureFeatures, PixelScale] | None:
-    """Return the features of a capture, and its PixelScale; None if the capture shows too little.
+    """Return the features of a capture and its PixelScale, or None if too few pixels are usable.
 
     The mask (H, W) has P pixels with normals (P, 3) and errors (P, 2); see networks/li_ne_net.py.
-    Lights are (F, 3), unit; of near lamps, at the origin. `lighting_at` returns the light of given
-    pixels.
+    The lights (F, 3) are unit vectors, at the origin for near lamps. `lighting_at` returns the
+    light of given pixels.
     """
     n_lights = len(lights)
     if n_lights < _FEWEST_LIGHTS:
@@ -193,15 +197,16 @@ def capture_features(
     difference = angle_between_deg(own, best)
 
     def explain(terms: Float64Array, sign: int) -> tuple[float, float, float]:
-        """Return the amount of `terms` (p, F) in the residuals, the share it explains, and log of
-        its rotation.
+        """Return the amount of `terms` (p, F) in the residuals, the share that they explain, and
+        the log of the rotation.
 
-        An amount of the other sign is not such a fault, and does not rotate any normals.
+        An amount with the opposite sign is not due to this fault and does not rotate normals.
         """
         scaled_terms = fit_scaled_normals(terms, weights, lights)
         terms = terms - scaled_terms @ lights.T
         power = (weights * terms**2).sum()
-        # The terms hold to first order in width over distance, or in the change of the exponent.
+        # The terms are accurate to first order in width over distance, or in the change of the
+        # exponent.
         amount = float(((weights * terms * residuals).sum() / max(power, 1e-12)).clip(-1.5, 1.5))
         share = amount**2 * power / max((weights * residuals**2).sum(), 1e-12)
         turn = angle_between_deg(best, unit(scaled - sign * max(sign * amount, 0.0) * scaled_terms))
@@ -232,8 +237,8 @@ def capture_features(
         shadow=float(1 - lit.mean()),
         dark=float(1 - kept.mean()),
     )
-    # By how much lamps at a distance of one width change a normal (3,), over the normal (3,) and
-    # place (2,)
+    # The change (3,) of a normal by lamps at a distance of one width, per normal (3,) and place
+    # (2,)
     solve = np.linalg.pinv(lights)
     turning = 3 * np.einsum("kf,fi,fj->kij", solve, lights, lights[:, :2])
     for axis in range(2):
@@ -248,8 +253,8 @@ def _log_median(values: Float64Array, least: float = _LEAST_SHARE) -> float:
 def _residuals_under(
     normals: Float64Array, values: Float64Array, lit: Float64Array, lights: Float64Array
 ) -> Float64Array:
-    """Return the residuals of values (p, F) for matte pixels with these normals (p, 3) and any
-    albedo.
+    """Return the residuals of values (p, F) for matte pixels with these normals (p, 3) and the best
+    albedos.
     """
     cosines = (normals @ lights.T).clip(min=0)
     seen = lit * (cosines > 0.05)  # predictions at grazing light are too uncertain

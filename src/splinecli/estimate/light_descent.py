@@ -1,10 +1,10 @@
-"""Lights for which the network that estimates normals expects the smallest errors, and for which
+"""Search for lights under which the network that estimates normals predicts the smallest errors and
 its normals have the least curl.
 
-The network was trained under correct lights, on many reflectances. Under wrong lights, the
-observations of a pixel agree with none of these, and it expects larger errors: also on metals and
-glossy surfaces, whose images a matte surface does not explain. The expected error is
-differentiable, so the lights follow its gradient.
+The network was trained under correct lights on many reflectances. Under wrong lights, the
+observations of a pixel match none of these, so it predicts larger errors, even for metals and
+glossy surfaces, which a matte model does not explain. The predicted error is differentiable, so its
+gradient is used for the search.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from splinecli.maths.pixel_grid import Blocks
 from splinecli.system.machine import in_order, one_thread_each
 
 _GRID_PIXELS, _MOST_LIGHTS = 500, 30
-_STEPS, _STEP, _OWN_STEP = 14, 0.06, 0.01  # in common, and of each light by itself
-# for a doubt about given lights
+_STEPS, _STEP, _OWN_STEP = 14, 0.06, 0.01  # of the common matrix, and of each light
+# for checking given lights
 _FEW_PIXELS, _FEW_STEPS, _DOUBT_DEG = 250, 8, 10.0
-# which is given up if the cost falls by less in the first half of the steps, as under right lights
+# The check stops if the cost falls by less in the first half of the steps, as with correct lights
 _HALF_FALL = 0.25
-# Weights, in units of the logarithm of the expected error: of the curl of the normals, of the
-# distance from the start, and of the spread of the albedo, which unknown intensities would tilt
-# (Alldrin, Mallick and Kriegman, "Resolving the generalized bas-relief ambiguity by entropy
-# minimization", CVPR 2007).
+# Weights, relative to the logarithm of the predicted error, of the curl of the normals, of the
+# distance from the start, and of the spread of the albedo, which increases if unknown intensities
+# are wrong (Alldrin, Mallick and Kriegman, "Resolving the generalized bas-relief ambiguity by
+# entropy minimization", CVPR 2007).
 _CURL, _NEAR, _ALBEDO = 1.5, 0.5, 1.0
 _CURL_TO_CHOOSE, _GUESS_TO_CHOOSE, _FIRST_TO_CHOOSE = 2.0, 0.3, 0.3
 _LEAST_Z, _LEAST_LIGHT_Z, _LEAST_COSINE = 0.2, 0.05, 0.2
-_INTENSITY_SPREAD = 0.3  # standard deviation of the logarithm, of each intensity by itself
+_INTENSITY_SPREAD = 0.3  # standard deviation of the logarithm of each intensity
 
 
 def best_lights(
@@ -57,9 +57,10 @@ def best_lights(
     """Return the best lights near one of the starts.
 
     The observations (P, F) are linear, divided by the light intensities if these are known. The
-    mask (H, W) has P true pixels, in row-major order. The lights stay near their start, within the
-    errors (F,) in degrees. Another start than the first must be clearly better; the guess (F, 3),
-    with errors of its own, is a weak witness. Bump and hollow are equal.
+    mask (H, W) has P true pixels, in row-major order. `errors_deg` (F,) are the expected distances
+    of the lights from their start, in degrees. Any start except the first must be clearly better to
+    be chosen; the guess (F, 3), with separate errors, has a low weight. Bumps and hollows are not
+    distinguished.
     """
     count = observations.shape[1]
     used = _some_lights(count)
@@ -68,7 +69,7 @@ def best_lights(
     follow = partial(_follow, images, errors, intensities_known=intensities_known)
     parts = [Lights(each.directions[used], each.intensities[used]) for each in starts]
     with one_thread_each() as threads:
-        # as in side_by_side, but with gradients
+        # like side_by_side, but with gradients
         found = [*in_order(follow, parts, threads, lambda: torch.set_num_threads(1))]
 
     def cost(each: _Followed) -> float:
@@ -95,7 +96,7 @@ def best_lights(
     lights = found[best].lights
     if len(used) < count:
         start = starts[best]
-        # The others move with them.
+        # Move the other lights by the same matrix.
         move = np.linalg.lstsq(start.directions[used], lights.directions, rcond=None)[0]
         directions, intensities = unit(start.directions @ move), start.intensities.copy()
         directions[used], intensities[used] = lights
@@ -109,7 +110,7 @@ def _some_lights(count: int) -> Integers:
 
 @dataclass(frozen=True, eq=False)
 class LightWitness:
-    """What the network says of the given lights (F, 3) of images, and of others."""
+    """Assessment of the given lights (F, 3) of images, and of alternatives, by the network."""
 
     images: _Images
     used: Integers
@@ -117,13 +118,15 @@ class LightWitness:
 
     @classmethod
     def of(cls, observations: Floats, mask: Bools, given: Float64Array) -> LightWitness:
-        """Return the witness of observations (P, F), which were divided by the intensities."""
+        """Return the witness for observations (P, F), which are divided by the light
+        intensities.
+        """
         used = _some_lights(len(given))
         return cls(_Images.of(observations[:, used], mask, _FEW_PIXELS), used, given)
 
     def cost(self, directions: Float64Array) -> float:
-        """Return the logarithm of the errors that the network expects under lights (F, 3), plus
-        that of the curl of its normals, weighted.
+        """Return the mean logarithm of the errors that the network predicts under lights (F, 3),
+        plus the weighted logarithm of the curl of its normals.
         """
         lights = torch.tensor(directions[self.used], dtype=torch.float32)
         with torch.no_grad(), one_thread_each():
@@ -131,8 +134,8 @@ class LightWitness:
         return _Followed(Lights(directions, directions), expected.item(), curl.item()).cost
 
     def descend(self, *, intensities_known: bool) -> tuple[float, float]:
-        """Return how much lower the cost is under better lights near the given ones, and their mean
-        distance in degrees from these.
+        """Return by how much the cost falls under better lights near the given ones, and the mean
+        angle in degrees between both.
         """
         given = self.given[self.used]
         errors = torch.full((len(given),), np.radians(_DOUBT_DEG), dtype=torch.float32)
@@ -162,10 +165,12 @@ class _Followed(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Images:
-    """The bright pixels of images on a coarse grid, and the neighbours of inner ones."""
+    """The bright pixels of images on a coarse grid, and the neighbours of inner pixels."""
 
     values: Tensor  # (p, F)
-    neighbours: Tensor  # (5, n): the pixels themselves, those right and left, above and below
+    neighbours: (
+        Tensor  # (5, n), indices of pixels and their right, left, upper and lower neighbours
+    )
 
     @classmethod
     def of(cls, observations: Floats, mask: Bools, most: int = _GRID_PIXELS) -> _Images:
@@ -190,13 +195,14 @@ class _Images:
         return cls(torch.tensor(scaled, dtype=torch.float32), torch.from_numpy(neighbours))
 
     def judge(self, directions: Tensor, log_intensities: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the mean logarithm of the errors that the network expects under lights, the curl
-        of its normals, and the spread of the logarithm of the albedo that these leave.
+        """Return the mean logarithm of the errors that the network predicts under lights, the curl
+        of its normals, and the spread of the logarithm of the resulting albedo.
         """
         observed = self.values / log_intensities.exp()
         normals, error = _network()(observed, directions)
         cosines = (normals @ directions.T).clamp(min=0)
-        # Shadows and highlights are dark and bright outliers.
+        # Fit the albedo without shadows, and use absolute deviations because highlights are
+        # outliers.
         lit = (cosines > _LEAST_COSINE).float()
         fitted = (lit * observed * cosines).sum(dim=1) / (lit * cosines**2).sum(dim=1).clamp(1e-6)
         albedo = fitted.clamp(min=1e-6).log()
@@ -211,7 +217,7 @@ class _Images:
         here, right, left, above, below = self.neighbours
         p_x, q_x = (slopes[right] - slopes[left]).unbind(1)
         p_y, q_y = (slopes[above] - slopes[below]).unbind(1)
-        # A root at zero has no gradient.
+        # The square root has no gradient at zero.
         size = (p_x**2 + p_y**2 + q_x**2 + q_y**2 + 1e-8).sqrt()
         curl = ((p_y - q_x) ** 2 + 1e-8).sqrt()
         largest = size.detach().quantile(0.95)
@@ -222,7 +228,7 @@ class _Images:
 
 @cache
 def _network() -> SplineNet:
-    """Load the network whose expectations count, in float32. Raises ModelError."""
+    """Return the network that predicts the errors, in float32. Raises ModelError."""
     network = resolve_weights(DEFAULT_METHOD).network
     return network.requires_grad_(False)
 
@@ -236,8 +242,9 @@ def _follow(
     steps: int = _STEPS,
     half_fall: float = 0.0,
 ) -> _Followed:
-    """Return the best lights on the way of a gradient descent (Adam, Kingma and Ba, ICLR 2015) from
-    a start. All lights move together by a matrix, and each a little by itself.
+    """Return the best lights on the path of a gradient descent (Adam, Kingma and Ba, ICLR 2015).
+
+    From the start, all lights move by a common matrix, and each of them slightly on its own.
     """
     directions = start.directions.copy()
     directions[:, 2] = directions[:, 2].clip(min=_LEAST_LIGHT_Z)
@@ -254,7 +261,7 @@ def _follow(
         vectors = began @ (torch.eye(3) + common) + own
         lights = normalize(vectors, dim=1)
         relative = logs
-        if not intensities_known:  # a matte surface has the same images under these
+        if not intensities_known:  # these give the same images of a matte surface
             relative = logs + own_logs + vectors.norm(dim=1).log()
             relative = relative - relative.mean()
         expected, curl, spread = images.judge(lights, relative)

@@ -1,3 +1,3 @@
-"""Information missing from image values: white level, saturated values, mask, intensities and
-colours of lamps.
+"""Estimate information that the image values lack: white level, saturated values, mask, and lamp
+intensities and colours.
 """

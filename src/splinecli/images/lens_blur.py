@@ -1,10 +1,9 @@
-"""Blur caused by the lens and the Bayer pattern: its width in the images of a capture, and
-observations without it.
+"""Estimate and remove the blur of the lens and the Bayer pattern in the images of a capture.
 
-A blur of 0.7 pixels costs more accuracy than all other faults of a usual capture together, because
-it fills shadows, flattens highlights and mixes the outline with the background. Its width is
-estimated from the images alone: edges of shadows and highlights, and the outline of the object, are
-steps on any surface. A Wiener filter then inverts the blur.
+A blur of 0.7 pixels reduces accuracy more than all other faults of a typical capture together,
+because it fills shadows, flattens highlights and mixes the outline with the background. Its width
+is estimated from the images alone, because edges of shadows and highlights and the outline of the
+object are steps on any surface. A Wiener filter then inverts the blur.
 """
 
 from __future__ import annotations
@@ -17,16 +16,16 @@ from numpy.typing import NDArray
 from splinecli.maths import Bools, Float32Array, Float64Array
 from splinecli.maths.pixel_grid import bounds
 
-# Half of the filter's side minus one: the number of pixels around the object that it mixes in
+# Half of (the side of the filter minus 1), the number of pixels around the object that it uses
 REACH = 6
-WIDEST_SIGMA = 1.2  # the widest blur among the captures to which the estimate was fitted
-# Mean power of the noise over the images' mean power. Chosen on rendered captures with noise, 8
-# bits and JPEG.
+WIDEST_SIGMA = 1.2  # the widest blur of the captures used to fit the estimate
+# Mean power of the noise relative to the images, chosen on rendered captures with noise, 8 bits and
+# JPEG.
 NOISE = 0.005
-_SQUARES, _SIDE = 16, 128  # a capture with more pixels is only analysed in this many squares
+_SQUARES, _SIDE = 16, 128  # of a larger capture, only this many squares are analysed
 
-# benchmarks/fit_lens_blur.py writes these: mean and deviation of each number of _edge_numbers, and
-# the coefficients of a quadratic polynomial of the five.
+# Written by benchmarks/fit_lens_blur.py: mean and standard deviation of each number from
+# edge_numbers, and the coefficients of a quadratic polynomial of all five.
 _MEANS = (0.5511, 0.6893, 0.5505, 0.1675, 0.01223)
 _DEVIATIONS = (0.1537, 0.1952, 0.2823, 0.2043, 0.1355)
 _COEFFICIENTS = (
@@ -55,9 +54,7 @@ _COEFFICIENTS = (
 
 
 def surroundings(mask: Bools) -> Bools:
-    """Return the pixels (H, W) around a mask that remove_blur needs;
-    none of them is in the mask.
-    """
+    """Return the pixels (H, W) around a mask that remove_blur needs, without the mask itself."""
     return _grown(mask, REACH) & ~mask
 
 
@@ -78,13 +75,13 @@ def remove_blur(observations: Float32Array, mask: Bools, around: Bools) -> float
 
     rows, n_pixels = pixel_rows(mask, around), np.count_nonzero(mask)
     numbers = edge_numbers(observations, mask, rows)
-    # A higher correlation of gradients at a distance of three pixels shows shading alone, and no
-    # edge. No blur of up to WIDEST_SIGMA reaches it.
+    # A higher correlation of gradients three pixels apart means that there is only shading and no
+    # edge, because a blur of up to WIDEST_SIGMA does not reach it.
     if numbers is None or numbers[-1] > 0.5:
         return None
     terms = polynomial(numbers, np.array(_MEANS), np.array(_DEVIATIONS))
     sigma = min(float(terms @ np.array(_COEFFICIENTS)), _widest_at(numbers[2]), WIDEST_SIGMA)
-    if sigma < 0.4:  # it costs little, and its estimate is wrong by 0.1 to 0.2 pixels
+    if sigma < 0.4:  # such a blur does little harm, and its estimate is off by 0.1 to 0.2 pixels
         return None
     box = _box(mask, REACH)
     rows, inside, kernel = rows[box], mask[box], inverse_filter(sigma)
@@ -106,8 +103,8 @@ def are_soft(observations: Float32Array, mask: Bools, around: Bools) -> bool:
     cannot sharpen them; see there for the arguments.
     """
     numbers = edge_numbers(observations, mask, pixel_rows(mask, around))
-    # Behind a blur of 2 pixels, the steepest steps have 0.36 and 0.78, and 0.41 and 0.5 behind one
-    # of 1.2 pixels. Of 430 photographs and sharp rendered captures, none reaches both limits.
+    # The steepest steps have 0.36 and 0.78 with a blur of 2 pixels, and 0.41 and 0.5 with a blur of
+    # 1.2 pixels. None of 430 photographs and sharp rendered captures exceeds both limits.
     return numbers is not None and bool(numbers[1] < 0.41 and numbers[3] > 0.65)
 
 
@@ -122,24 +119,24 @@ def polynomial(
 
 
 def _widest_at(correlation: float) -> float:
-    """Return the widest blur at which gradients of neighbouring pixels have no more than this
-    correlation.
+    """Return the widest blur for which gradients of neighbouring pixels can have a correlation this
+    low.
 
-    Among surfaces behind the same blur, the correlation is lowest if the pixels are independent of
-    each other. The captures to which the polynomial was fitted do not have such fine texture.
+    For a given blur, the correlation is lowest on surfaces whose pixels are independent of each
+    other. The captures used to fit the polynomial do not have such a fine texture.
     """
     sigmas = np.linspace(0.05, 2, 200)
-    # Correlations of the values at a distance of one and of two pixels
+    # Correlations of values one and two pixels apart
     one, two = np.exp(-1 / (4 * sigmas**2)), np.exp(-1 / sigmas**2)
     of_gradients = (2 * one - 1 - two) / (2 - 2 * one)
     return float(np.interp(correlation + 0.1, of_gradients, sigmas))
 
 
 def inverse_filter(sigma: float) -> Float32Array:
-    """Return the filter (k, k) that best inverts a Gaussian blur, with the sum 1.
+    """Return the filter (k, k), with a sum of 1, that best inverts a Gaussian blur.
 
-    Of all filters of this size it has the least mean square error (Wiener's criterion) for white
-    noise and images whose power falls with the square of the frequency, as it does for edges.
+    Among filters of this size, it has the smallest mean square error (Wiener's criterion) for white
+    noise and images whose power falls with the square of the frequency, as for edges.
     """
     frequencies = np.arange(33) / 64
     places = np.arange(REACH + 1)
@@ -161,14 +158,14 @@ def inverse_filter(sigma: float) -> Float32Array:
 def edge_numbers(
     observations: Float32Array, mask: Bools, rows: NDArray[np.int32]
 ) -> Float64Array | None:
-    """Return five numbers (5,) that measure the sharpness of a capture's images, or None with too
-    few edges.
+    """Return five numbers (5,) that measure the sharpness of a capture's images, or None if there
+    are too few edges.
 
-    Along rows and columns, the share that a local maximum of the gradient has in the sum with its
-    two neighbours: the lower and the upper quartile over the steepest ones. A step between two
-    pixels has 1; behind a blur of 0.7 pixels, it has 0.58. Then the correlation of the gradients of
-    neighbouring pixels between different images, which noise does not change, and of gradients at a
-    distance of two and three pixels in the same image.
+    The first two are the lower and upper quartile, over the steepest local maxima of the gradient
+    along rows and columns, of the share of a maximum in the sum of itself and its two neighbours.
+    It is 1 for a step between two pixels, and 0.58 with a blur of 0.7 pixels. The others are the
+    correlations of gradients of neighbouring pixels in different images, which noise does not
+    affect, and of gradients two and three pixels apart in the same image.
 
     See remove_blur for the observations and the mask, and pixel_rows for the rows. The object and a
     narrow strip around it are analysed, in few images and, in large captures, in few squares.
@@ -217,7 +214,9 @@ def _product(one: Float32Array, other: Float32Array) -> float:
 
 
 def pixel_rows(mask: Bools, around: Bools) -> NDArray[np.int32]:
-    """Return the rows (H, W) of the observations of remove_blur, -1 if a pixel has none."""
+    """Return the row of each pixel (H, W) in the observations of remove_blur, -1 for pixels without
+    one.
+    """
     rows = np.full(mask.shape, -1, np.int32)
     n_pixels = np.count_nonzero(mask)
     rows[mask] = np.arange(n_pixels, dtype=np.int32)
@@ -226,7 +225,7 @@ def pixel_rows(mask: Bools, around: Bools) -> NDArray[np.int32]:
 
 
 def _looked_at(mask: Bools, region: Bools) -> list[tuple[slice, slice]]:
-    """Return the parts (y, x) of a capture used to measure its blur: all of it, or squares of one
+    """Return the parts (y, x) of a capture used to measure its blur: all of it, or squares of equal
     size.
     """
     box = _box(region, 0)
@@ -241,7 +240,9 @@ def _looked_at(mask: Bools, region: Bools) -> list[tuple[slice, slice]]:
 
 
 def _box(mask: Bools, margin: int) -> tuple[slice, slice]:
-    """Return the part (y, x) of an image that holds a mask (H, W) and as many pixels around it."""
+    """Return the part (y, x) of an image that contains a mask (H, W) and a margin of so many
+    pixels.
+    """
     y, x = (
         slice(max(first - margin, 0), last + margin + 1)
         for first, last in (side.tolist() for side in bounds(mask))

@@ -2,9 +2,9 @@
 
 The white level of a capture is the stored value at which its camera saturated. Cameras of 10 to 14
 bits often store their values in 16-bit files without scaling them, so that nothing ever reaches the
-file's full scale. Clipping is still visible in the values. Many observations share the images'
-exact maximum, and far fewer have the values just below it. On a smooth surface without clipping,
-the maximum is no more frequent than they are.
+file's full scale. Clipping is still visible in the values, because many observations share the
+exact maximum of the images, and far fewer have the values just below it. Without clipping, the
+maximum on a smooth surface is not more frequent than these values.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from splinecli.maths.robust import absolute_weights, fit_scaled_normals, shade, 
 from splinecli.records.capture_warnings import WHITE_LEVEL, CaptureWarning
 from splinecli.records.white_level import WhiteLevel
 
-# From p rows of the observations to light vectors (F, 3) or (p, F, 3), whose products with its
-# scaled normal a matte pixel shows.
+# From p rows of the observations to light vectors (F, 3) or (p, F, 3). Their dot products with the
+# scaled normal of a matte pixel are its observations.
 LightsOf = Callable[[Integers], Float64Array]
 
 
 def find_saturated(pixels: Array) -> Bools:
-    """Return which stored pixels (P, C) have a channel at full scale, (P,). Floating-point pixels
-    have none.
+    """Return which stored pixels (P, C) have a channel at full scale, as booleans (P,), never for
+    floating-point pixels.
     """
     if pixels.dtype.kind != "u":
         return np.zeros(len(pixels), np.bool_)
@@ -40,21 +40,21 @@ def find_saturated(pixels: Array) -> Bools:
 
 
 def in_any_channel(flags: Bools) -> Bools:
-    """Return flags.any(axis=1) of flags (P, C), C at most 3, several times as fast."""
+    """Return flags.any(axis=1) for flags (P, C), C at most 3, but several times as fast."""
     return np.asarray(reduce(np.logical_or, flags.T))
 
 
 def restore_saturated(
     observations: Float32Array, saturated: Bools, lights: Float64Array | LightsOf
 ) -> Bools | None:
-    """Replace saturated observations (P, F) by estimates, in place; return which were replaced, or
+    """Replace saturated observations (P, F) with estimates in place; return which were replaced, or
     None.
 
     A saturated observation was at least as bright as stored. Its estimate is the prediction of a
     robust Lambertian fit to the pixel (least absolute deviations by reweighting) or the stored
     value, whichever is brighter. The fit is repeated on the restored values, so a saturated
-    observation can only raise it. Without this, a pixel would either lose its brightest
-    observations, or its normal would tilt towards the mean of the lights (figures in
+    observation can only raise the fitted values. Without this, a pixel would either lose its
+    brightest observations, or its normal would tilt towards the mean of the lights (figures in
     docs/measurements.md). Pixels that are saturated under every light are left unchanged. The
     lights are unit directions (F, 3), or see LightsOf.
     """
@@ -72,20 +72,20 @@ def _restored(stored: Float32Array, saturated: Bools, lights: Float32Array) -> F
     scale[scale <= 0] = 1
     values = lowest = stored / scale
     weights = lit = shadow_weights(lowest)
-    for _ in range(16):  # more fits change the restored values by less than the fit's own error
+    for _ in range(16):  # further fits change the restored values by less than the error of the fit
         predicted = shade(fit_scaled_normals(values, weights, lights), lights)
         residuals = predicted - lowest
         raised = saturated & (residuals > 0)
-        # No observation is restored to more than eight times the pixel's brightest stored one.
+        # No observation is restored to more than eight times the pixel's brightest stored value.
         values = np.where(raised, np.minimum(predicted, 8.0), lowest)
-        # An observation that the fit meets has a weight of 50; raised ones only matter if the
-        # others do not suffice.
+        # An observation that agrees with the fit has a weight of 50, so raised observations matter
+        # only if the others do not suffice.
         weights = lit * np.where(raised, np.float32(0.1), absolute_weights(residuals))
     # Rounding must not make a value darker than stored.
     return np.asarray(np.where(saturated, np.maximum(values * scale, stored), stored))
 
 
-COMPARED_VALUES = 16  # number of different values below the maximum whose observations are counted
+COMPARED_VALUES = 16  # number of distinct values below the maximum whose observations are counted
 _BLOCK = 1 << 20
 _FULL_SCALE_16_BIT = 65_535
 
@@ -100,7 +100,9 @@ def white_level_warnings(level: WhiteLevel | None) -> list[CaptureWarning]:
     """Warn about a white level that was found in the images because no file states it."""
     if level is None or level.origin != "images":
         return []
-    text = f"The images look clipped at {level.value:g}, so this value is treated as saturated."
+    text = (
+        f"The images seem to be clipped at {level.value:g}, so this value is treated as saturated."
+    )
     return [CaptureWarning(WHITE_LEVEL, f"{text} Use --white-level N to set another value.")]
 
 
@@ -130,10 +132,12 @@ class Saturation:
 
     n_pixels: int  # P, the number of the mask's pixels
     images: tuple[ImageValues, ...]
-    given: float | None = None  # the white level that the user gave; None to find it
-    # the pixels whose observations are wanted; None for all. The level is decided from all pixels
+    given: float | None = None  # the white level from the user; None to determine it
+    # the pixels whose observations are needed; None for all. The level is always determined from
+    # all pixels
     rows: Integers | None = None
-    # whether the images show an even target; a single image of it may be clipped, even completely
+    # whether the images show a uniform target, of which a single image may be clipped, even
+    # completely
     even: bool = False
 
     @property
@@ -159,10 +163,10 @@ class Saturation:
 
     @property
     def bits(self) -> int | None:
-        """The bits of a camera whose values seem to be stored in 16-bit files without scaling;
-        None otherwise.
+        """The bit depth of a camera whose values seem to be stored in 16-bit files without scaling,
+        or None.
 
-        Scaled values of fewer bits have common divisors.
+        Scaled values of a smaller bit depth have common divisors.
         """
         level = self.white_level
         if level is None or level.origin != "full scale" or level.value != _FULL_SCALE_16_BIT:
@@ -178,7 +182,7 @@ class Saturation:
 
     def choose_images(self, positions: Sequence[int]) -> Saturation:
         """Return the white level and the saturated observations of some of the images, determined
-        from these images alone.
+        only from these images.
         """
         return replace(self, images=tuple(self.images[position] for position in positions))
 
@@ -225,11 +229,11 @@ class Saturation:
         fewest = 1 if even_at_bits else 2 if _is_bits(maximum) else 3
         if len(reaching) < fewest:
             return False
-        # A flat background has one value under all lights. Clipped pixels are bright under some
-        # lights only.
+        # A flat background has the same value under all lights. Clipped pixels are bright only
+        # under some lights.
         images_at_maximum = np.bincount(np.concatenate(reaching), minlength=self.n_pixels)
         number = int(images_at_maximum[images_at_maximum < max(len(reaching), 2)].sum())
-        # Each image has its largest values, so the largest of all are among them, with all of their
+        # The largest values of all images are among the largest of each image, with complete
         # counts.
         below, places = np.unique(
             np.concatenate([image.below for image in images]), return_inverse=True
@@ -246,9 +250,9 @@ def look_at(
 ) -> ImageValues:
     """Return the values that decide which of an image's pixels (P, C), as stored, are saturated.
 
-    `given` is the white level that the user gave, None to find it; `stated` the one that the file
-    states, 2^bits - 1 for a number of bits, None if it states none. Raises InputError if the given
-    one is above the image's full scale.
+    `given` is the white level from the user, None to determine it; `stated` is the white level
+    stated in the file (2^bits - 1 for a bit depth), or None. Raises InputError if the given level
+    is above the image's full scale.
     """
     full_scale = int(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else None
     if given is not None:
@@ -257,7 +261,7 @@ def look_at(
                 f"the white level is {given:g}, but {full_scale.bit_length()}-bit pixels end at"
                 f" {full_scale}"
             )
-            raise InputError(problem, path=path, hint="Lower the white level, or leave it out")
+            raise InputError(problem, path=path, hint="Lower the white level, or omit it")
         return ImageValues(full_scale, stated, _indices(in_any_channel(pixels >= given)))
     maximum = int(pixels.max(initial=0)) if pixels.dtype == np.uint16 else 0
     if not maximum:
@@ -282,7 +286,7 @@ def _largest_values(
     """
     lowest_compared = math.ceil(0.5 * maximum)  # clipping cuts through a continuous range of values
     values = pixels.reshape(-1)
-    # Few values are near the maximum. The others are counted only if these are not enough.
+    # Few values are near the maximum. The others are counted only if these do not suffice.
     for lowest in (max(lowest_compared, maximum - 1024), lowest_compared):
         counts = np.zeros(maximum + 1 - lowest, np.int64)
         for start in range(0, len(values), _BLOCK):

@@ -216,7 +216,7 @@ def test_too_few_pixels():
     """The sample is half of the lit pixels at most: of 127, 63."""
     normals, observations = glossy(127)
     teacher = sure(observations, normals)
-    with refuses("127 pixels are lit, too few to distil the network", UsageError):
+    with refuses("only 127 pixels are lit, which is too few to distil the network", UsageError):
         learn(teacher)
 
 

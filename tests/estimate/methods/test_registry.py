@@ -70,12 +70,12 @@ def test_weights_of_the_other_network(weights, tmp_path):
         (
             "cnn-ps",
             weights,
-            "'tiny' are for SPLINE-Net; the method cnn-ps .* Use them with --method spline-net",
+            "'tiny' are for SPLINE-Net, so the method cnn-ps .* Use them with --method spline-net",
         ),
         (
             "spline-net",
             alone,
-            "'alone' are for CNN-PS; the method spline-net .* Use them with --method cnn-ps",
+            "'alone' are for CNN-PS, so the method spline-net .* Use them with --method cnn-ps",
         ),
     ):
         with refuses(message, ModelError):
@@ -84,7 +84,7 @@ def test_weights_of_the_other_network(weights, tmp_path):
 
 @parametrize("options", [MethodOptions(rotations=0), MethodOptions(batch_size=0)])
 def test_counts_from_one(options, weights):
-    with refuses("whole numbers from 1", UsageError):
+    with refuses("whole numbers of at least 1", UsageError):
         make_estimator("spline-net", replace(options, weights=weights))
 
 

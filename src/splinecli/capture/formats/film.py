@@ -62,7 +62,7 @@ def choose_frames(film: Path) -> tuple[int, ...]:
     chosen = _farthest(thumbnails[usable])
     if len(chosen) < FEWEST_FRAMES:
         raise InputError(
-            f"found {len(chosen)} sharp frames under different lights among {len(numbers)},"
+            f"only {len(chosen)} of {len(numbers)} frames are sharp and under different lights,"
             f" expected at least {FEWEST_FRAMES}",
             film,
             hint="Record from a tripod with focus and exposure locked, while you move the lamp all"

@@ -1,19 +1,19 @@
-"""ST14: a bi-polynomial reflectance, fitted to the lowest intensities above the shadows.
+"""ST14: a bi-polynomial reflectance fitted to the lowest intensities above the shadows.
 
 B. Shi, P. Tan, Y. Matsushita, K. Ikeuchi, "Bi-polynomial modeling of low-frequency reflectances",
 TPAMI 2014:
 
     I_j = rho(n.h_j, l_j.h_j) n.l_j,    rho a polynomial of order 2 in each argument,
 
-with h_j the bisector of light l_j and view v = (0, 0, 1). Highlights affect only the high
-intensities. The rest of the reflectance varies slowly. For a given normal the coefficients are
-linear, so only the normal is searched (variable projection).
+where h_j is the bisector of the light l_j and the view v = (0, 0, 1). Highlights affect only the
+high intensities; the rest of the reflectance varies slowly. For a given normal, the model is linear
+in the coefficients, so the search is only over the normal (variable projection).
 
-The lowest intensities alone do not determine nine coefficients well. This module therefore differs
-from the paper in two ways. Coefficients are left out if few observations are kept. All but the
-constant one have a Gaussian prior around zero, that is, around Lambert's law. The fit also
-estimates the noise that the prior is weighed against (D. J. C. MacKay, "Bayesian interpolation",
-Neural Computation 1992), so exact data are fitted exactly.
+The lowest intensities alone do not determine nine coefficients well. Therefore, this module differs
+from the paper in two ways. If few observations are kept, some coefficients are omitted. All except
+the constant one have a Gaussian prior around zero, that is, around Lambert's law. The noise against
+which the prior is weighed is also estimated (D. J. C. MacKay, "Bayesian interpolation", Neural
+Computation 1992), so exact data are fitted exactly.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from torch.nn.functional import normalize
 
 from splinecli.estimate.fits.least_squares import lit_observations, weighted_least_squares
 
-RANGE = 0.25  # divisor of 1 - n.h and 1 - l.h: about their range where a surface is lit and visible
+RANGE = 0.25  # divisor of 1 - n.h and 1 - l.h, about their range on lit and visible surfaces
 
-# Order in which coefficients enter the model. Index 3 a + b belongs to (1 - n.h)^a (1 - l.h)^b.
-# Lower degrees come first; within a degree, those with larger a.
+# Order in which coefficients are added to the model. Index 3 a + b belongs to (1 - n.h)^a (1 -
+# l.h)^b. Lower degrees come first and, within a degree, larger a.
 PLACE = (0, 2, 5, 1, 4, 7, 3, 6, 8)
 
 
 def solve_st14(observations: Tensor, light_directions: Tensor) -> Tensor:
-    """Return normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3); zero for
-    dark pixels.
+    """Return normals (P, 3) from observations (P, F) under lights (F, 3) or (P, F, 3), zero for
+    black pixels.
     """
     lights = light_directions.double()
-    # The normal equations square the condition number, so single precision would not be exact
+    # The normal equations square the condition number, so single precision would not be accurate
     # enough.
     problem = _select(observations.double(), lights)
-    # Start at least squares. A coarse search of the hemisphere finds lower costs, but worse
+    # Start from least squares. A coarse search over the hemisphere finds lower costs but worse
     # normals.
     all_alike = torch.ones_like(observations, dtype=torch.float64)
     normals = normalize(weighted_least_squares(observations.double(), lights, all_alike)[0], dim=1)
@@ -60,22 +60,22 @@ def solve_st14(observations: Tensor, light_directions: Tensor) -> Tensor:
 
 
 def kept_count(lit: Tensor) -> Tensor:
-    """Return how many of `lit` observations are kept: a quarter (T_low of the paper), at least 8,
-    or all of fewer.
+    """Return how many of `lit` observations are kept: a quarter (T_low in the paper), but at least
+    8 if there are as many.
     """
     return torch.maximum((0.25 * lit).ceil().long(), lit.clamp(max=8))
 
 
 class _Problem(NamedTuple):
-    """The kept observations of a batch of pixels, at most K each, and the prior."""
+    """The observations kept for a batch of pixels, at most K per pixel, and the prior."""
 
-    intensities: Tensor  # (P, K), the largest of a pixel 1
+    intensities: Tensor  # (P, K), scaled to a largest value of 1 per pixel
     lights: Tensor  # (P, K, 3)
     bisectors: Tensor  # (P, K, 3)
     light_powers: Tensor  # (P, K, 3), powers of 1 - l.h
     precision: Tensor  # (9,), of the prior
-    ridge: Tensor  # (P, 9), which removes coefficients from the model
-    facing: Tensor  # (P, F + 1, 3), the directions that the normal has to face
+    ridge: Tensor  # (P, 9), large for coefficients that are removed from the model
+    facing: Tensor  # (P, F + 1, 3), the directions that the normal must face
 
 
 class _Fit(NamedTuple):
@@ -89,8 +89,8 @@ class _Fit(NamedTuple):
     curvature: Tensor  # (P, 2, 2), half the second derivative
 
     def step(self, damping: Tensor) -> Tensor:
-        """Return normals (P, 3) after a Levenberg-Marquardt step, damped by (P,) times the mean
-        curvature.
+        """Return normals (P, 3) after a Levenberg-Marquardt step, damped by `damping` (P,) times
+        the mean curvature.
         """
         size = self.curvature.diagonal(dim1=1, dim2=2).mean(dim=1)
         damped = self.curvature + torch.diag_embed((damping * size + 1e-12)[:, None].expand(-1, 2))
@@ -98,7 +98,9 @@ class _Fit(NamedTuple):
         return normalize(self.normals + (self.tangents @ move[..., None])[..., 0], dim=1)
 
     def replaced(self, trial: _Fit, better: Tensor) -> _Fit:
-        """Return this fit, with the trial's values for the pixels it improves: `better` (P,)."""
+        """Return this fit with the trial's values for the pixels that it improves, `better`
+        (P,).
+        """
         pairs = zip(trial, self, strict=True)
         return _Fit(
             *(torch.where(better.view(-1, *[1] * (old.dim() - 1)), new, old) for new, old in pairs)
@@ -109,13 +111,14 @@ def _select(observations: Tensor, lights: Tensor) -> _Problem:
     count = observations.shape[1]
     view = lights.new_tensor((0.0, 0.0, 1.0))
     ordered, index = observations.sort(dim=1)
-    # The four brightest are never treated as shadows: three for the normal, one for the noise.
+    # The four brightest are never treated as shadows, because three are needed for the normal and
+    # one for the noise.
     is_lit = lit_observations(observations, 0.4, fewest=4) & (observations > 0)
     lit = is_lit.sum(dim=1)
     kept = kept_count(lit)
 
-    # Use as many places as a pixel without shadows needs, so that no pixel depends on the others in
-    # its batch.
+    # Use as many columns as a pixel without shadows needs, so that no pixel depends on the others
+    # in its batch.
     most = int(kept_count(torch.tensor(count)))
     rank = torch.arange(most, device=lights.device)
     place = (count - lit[:, None] + rank).clamp(max=count - 1)
@@ -129,7 +132,8 @@ def _select(observations: Tensor, lights: Tensor) -> _Problem:
 
     order = torch.arange(3, dtype=lights.dtype, device=lights.device)
     degree = (order[:, None] + order).flatten()
-    # Two observations for each coefficient, 1 to 9, and for each of the two angles of the normal.
+    # Require two observations for each of 1 to 9 coefficients and each of the two angles of the
+    # normal.
     coefficients = (kept // 2 - 2).clamp(1, len(PLACE))
     left_out = torch.tensor(PLACE, device=lights.device) >= coefficients[:, None]
     return _Problem(
@@ -138,8 +142,8 @@ def _select(observations: Tensor, lights: Tensor) -> _Problem:
         lights=kept_lights * is_kept[..., None],
         bisectors=bisectors,
         light_powers=_powers((kept_lights * bisectors).sum(dim=-1)),
-        # The prior's standard deviation, relative to the brightest kept observation, halves with
-        # each degree.
+        # The standard deviation of the prior, relative to the brightest kept observation, is halved
+        # with each degree.
         precision=torch.where(degree > 0, (0.1 * 0.5 ** (degree - 1)) ** -2, 0),
         ridge=torch.where(left_out, 1e9, 1e-12),
         facing=torch.cat((lights * is_lit[..., None], view.expand(len(observations), 1, 3)), dim=1),
@@ -147,7 +151,7 @@ def _select(observations: Tensor, lights: Tensor) -> _Problem:
 
 
 def _fit(problem: _Problem, normals: Tensor, noise: Tensor) -> _Fit:
-    """Fit the coefficients for normals (P, 3) and a variance of the noise (P,)."""
+    """Fit the coefficients for given normals (P, 3) and noise variances (P,)."""
     shading = (problem.lights @ normals[..., None])[..., 0].clamp(min=0)
     powers = _powers((problem.bisectors @ normals[..., None])[..., 0])
     design = (
@@ -164,8 +168,8 @@ def _fit(problem: _Problem, normals: Tensor, noise: Tensor) -> _Fit:
     slack = (prior * torch.cholesky_inverse(factor).diagonal(dim1=1, dim2=2)).sum(dim=1)
     freedom = (problem.intensities > 0).sum(dim=1) - (2 + len(PLACE) - slack)
 
-    # The derivative of the model by the normal, without the part that the coefficients absorb
-    # (Kaufman's approximation).
+    # The derivative of the model with respect to the normal, without the part that the coefficients
+    # absorb (Kaufman's approximation).
     by_power = problem.light_powers @ coefficients.view(-1, 3, 3).mT
     reflectance = (powers * by_power).sum(dim=-1)
     slope = (by_power[..., 1] + 2 * powers[..., 1] * by_power[..., 2]) / -RANGE
@@ -181,8 +185,8 @@ def _fit(problem: _Problem, normals: Tensor, noise: Tensor) -> _Fit:
     away = (-problem.facing @ normals[..., None]).clamp(min=0).sum(dim=(1, 2))
     return _Fit(
         normals=normals,
-        # Normals that face away from the view, or from a light that reaches them, cost 10 a unit of
-        # cosine.
+        # Normals that face away from the view, or from a light that reaches them, cost 10 per unit
+        # of cosine.
         cost=squares + (prior * coefficients[..., 0].square()).sum(dim=1) + 10.0 * away,
         noise=squares / freedom.clamp(min=0.5),
         tangents=tangents,
@@ -192,6 +196,8 @@ def _fit(problem: _Problem, normals: Tensor, noise: Tensor) -> _Fit:
 
 
 def _powers(cosine: Tensor) -> Tensor:
-    """Return the powers 0, 1, 2 (..., 3) of (1 - cosine) / RANGE: an expansion about cosine = 1."""
+    """Return the powers 0, 1, 2 (..., 3) of (1 - cosine) / RANGE, for an expansion about cosine =
+    1.
+    """
     base = (1 - cosine) / RANGE
     return torch.stack((torch.ones_like(base), base, base.square()), dim=-1)

@@ -1,4 +1,4 @@
-"""The methods by name: a method is one file, and one row of METHODS.
+"""The methods by name. Each method is one file and one row of METHODS.
 
 The file is imported when the method is used.
 """
@@ -26,17 +26,17 @@ DEFAULT_METHOD = "spline-net"
 
 @dataclass(frozen=True)
 class MethodOptions:
-    """Settings of a method, None for its default. Each method ignores those that do not apply to
-    it.
+    """Settings of a method; None selects the method's default. Settings that do not apply are
+    ignored.
     """
 
-    weights: str | None = None  # a shipped name or a file
-    # number of rotations of the lights whose normals a network averages
+    weights: str | None = None  # the name of shipped weights, or a file
+    # number of rotations of the lights over which a network's normals are averaged
     rotations: int | None = None
-    # most pixels per batch. A processor computes a batch on each core
+    # most pixels per batch. On a CPU, each core computes one batch
     batch_size: int | None = None
     device: Device = "auto"  # where to compute; "auto" is a CUDA GPU if there is one
-    # of a network; "auto" is bfloat16 if the device computes natively in it
+    # of a network; "auto" is bfloat16 if the device supports it natively
     precision: Precision = "auto"
 
 
@@ -44,20 +44,20 @@ class MethodOptions:
 class Method:
     """A row of METHODS."""
 
-    # from the method's name and its options; does the heavy imports
+    # makes an estimator from the method's name and options, including heavy imports
     make: Callable[[str, MethodOptions], Estimator]
-    # principle, source: for the documentation; without a source, the method is splinecli's own
+    # for the documentation; a method without a source is splinecli's own
     principle: str
     source: str = "-"
-    observation_maps: bool = False  # whether figures of evaluations can show its observation maps
+    observation_maps: bool = False  # whether evaluations can plot its observation maps
 
 
 def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estimator:
-    """Return the estimator of this name.
+    """Return the estimator with this name.
 
-    Methods that run in PyTorch limit its threads to the cores that the process may use; see
+    Methods that use PyTorch limit its threads to the cores that the process may use; see
     splinecli.system.machine.use_available_cores. Raises UsageError if the name, the device or a
-    number is not valid, ModelError if the weights cannot be used.
+    number is invalid, or ModelError if the weights cannot be used.
 
     Examples:
         >>> from splinecli.estimate.methods import make_estimator
@@ -69,7 +69,7 @@ def make_estimator(name: str, options: MethodOptions = MethodOptions()) -> Estim
 
 
 def check_method(name: str) -> None:
-    """Raise UsageError if no method has this name. Loads nothing heavy."""
+    """Raise UsageError if no method has this name. Nothing heavy is imported."""
     check_one_of("method", name, METHODS)
 
 
@@ -97,8 +97,8 @@ def _network(
     interpolates: bool = True,
     refines: bool = True,
 ) -> Estimator:
-    """Return a network's estimator; one that interpolates has a LI-Net. Raises ModelError for other
-    weights.
+    """Return the estimator of a network, which has a LI-Net if it interpolates. Raises ModelError
+    if the weights are of the other kind.
     """
     from splinecli.estimate.methods.batched import NetworkEstimator
     from splinecli.estimate.networks.weights import resolve_weights
@@ -110,7 +110,7 @@ def _network(
     if loaded.network.config.interpolates != interpolates:
         kind, fitting = ("CNN-PS", "cnn-ps") if interpolates else ("SPLINE-Net", "spline-net")
         raise ModelError(
-            f"the weights {loaded.name!r} are for {kind}; the method {name} cannot use them",
+            f"the weights {loaded.name!r} are for {kind}, so the method {name} cannot use them",
             hint=f"Use them with --method {fitting}",
         )
     return NetworkEstimator(

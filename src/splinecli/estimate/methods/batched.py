@@ -1,5 +1,5 @@
-"""Estimators in torch, which split the pixels into batches: fits of reflectance models, SPLINE-Net
-and CNN-PS.
+"""Estimators in torch that process pixels in batches: fits of reflectance models, SPLINE-Net and
+CNN-PS.
 """
 
 from __future__ import annotations
@@ -34,14 +34,15 @@ from splinecli.system.machine import NumberFormat, one_thread_each, side_by_side
 from splinecli.system.progress import Progress, ignore
 
 Solve = Callable[[Tensor, Tensor], Tensor]
-"""(observations (P, F), the largest of each pixel 1; light directions (F, 3) or (P, F, 3)) ->
-normals (P, 3).
+"""Function from observations (P, F), with a largest value of 1 per pixel, and light directions
+(F, 3) or (P, F, 3) to normals (P, 3).
 
-The normals may have any length, 0 for a pixel that has none. All observations are finite, and none
-is negative."""
+The normals may have any length; a zero vector means that a pixel has no normal. All observations
+are finite and non-negative.
+"""
 
 
-_FEWEST_BATCHES, _FEWEST_AT_ONCE = 8, 256  # pixels; smaller batches take more time for each pixel
+_FEWEST_BATCHES, _FEWEST_AT_ONCE = 8, 256  # pixels; smaller batches take more time per pixel
 
 
 class _InBatches(Estimator):
@@ -58,18 +59,17 @@ class _InBatches(Estimator):
         progress: Progress,
         columns: int = 3,
     ) -> Float32Array:
-        """Call `solve` on batches of observations, side by side, and return its results (P,
-        columns).
+        """Return the results (P, columns) of `solve`, called on batches in parallel.
 
-        `solve` returns unit normals in the first three of its columns; zero vectors are replaced
-        with (0, 0, 1). It gets the observations (P, F) unscaled. `progress` is called after each
-        batch with the number of its pixels.
+        `solve` receives unscaled observations and returns unit normals in its first three columns;
+        zero vectors are replaced with (0, 0, 1). `progress` is called after each batch with its
+        number of pixels.
         """
         results = np.empty((len(observations), columns), np.float32)
         size = self.batch_size
         if self.device == "cpu":
-            # Few pixels make several smaller batches, whatever the number of cores, so that no core
-            # waits for another.
+            # Few pixels are split into several smaller batches, regardless of the number of cores,
+            # so that no core waits for another.
             size = min(size, max(_FEWEST_AT_ONCE, -(-len(observations) // _FEWEST_BATCHES)))
 
         def solve_batch(rows: slice) -> int:
@@ -88,10 +88,10 @@ class _InBatches(Estimator):
 
 
 class BatchedEstimator(_InBatches):
-    """An estimator that calls `solve` on batches of pixels, in float64.
+    """An estimator that calls `solve` on batches of pixels in float64.
 
-    Each pixel is first divided by its largest observation. Thresholds and priors thus have the same
-    meaning for dark and bright pixels, and the scale of the images does not matter. Raises
+    Each pixel is first divided by its largest observation, so that thresholds and priors have the
+    same meaning for dark and bright pixels, and the scale of the images does not matter. Raises
     UsageError for a batch size below 1.
     """
 
@@ -99,7 +99,7 @@ class BatchedEstimator(_InBatches):
 
     def __init__(self, name: str, solve: Solve, device: str, batch_size: int) -> None:
         if batch_size < 1:
-            raise UsageError("batch size is a whole number of at least 1")
+            raise UsageError("the batch size must be a whole number of at least 1")
         self.name, self.device, self.batch_size, self._solve = name, device, batch_size, solve
         self.fingerprint = f"{name} {self.precision}"
 
@@ -117,29 +117,27 @@ class BatchedEstimator(_InBatches):
         def solve_scaled(batch: Tensor, lights: Tensor) -> Tensor:
             batch = batch.clamp(min=0)
             normals = self._solve(batch / map_scale(batch), lights)
-            # The length may be tiny, and normalize would treat such a vector as zero. So divide in
-            # two steps.
+            # Divide in two steps, because normalize would treat a vector of tiny length as zero.
             largest = normals.abs().amax(dim=1, keepdim=True).clamp(min=1e-300)
             return normalize(normals / largest, dim=1)
 
         return self._solve_all(solve_scaled, observations, light_directions, progress)
 
 
-_CANDIDATES = 4096  # pixels from which the context of a capture is chosen
-_FEWEST_COVERED = 64  # with fewer fully covered candidates, all are used
+_CANDIDATES = 4096  # pixels among which the context of a capture is chosen
+_FEWEST_COVERED = 64  # if fewer candidates are fully covered, all are used
 # Smallest brightness of a fully covered outline pixel, relative to the mean of its inner neighbours
 _COVERED = 0.85
 
 
 def context_sample(lighting_at: LightingAt, mask: Bools) -> tuple[Tensor, Tensor]:
-    """Return the observations (S, F) and directions, (F, 3) or (S, F, 3), of the sample of a
+    """Return the observations (S, F) and light directions, (F, 3) or (S, F, 3), of a sample of a
     capture's pixels.
 
-    The mask (H, W) has one or more true pixels. Outline pixels that the object covers only in part
-    are left out, because they are too dark: on rendered spheres of 40 pixels, they doubled the
-    error of the other pixels. On small objects, the rule also leaves out some steep pixels that are
-    fully covered. It requires a mask that ends at the outline, because it finds the outline in the
-    mask.
+    The mask (H, W) has at least one true pixel. Outline pixels that the object covers only
+    partially are excluded, because they are too dark: on rendered spheres of 40 pixels, they
+    doubled the error of the other pixels. On small objects, this also excludes some steep pixels
+    that are fully covered. It only works if the mask ends at the object's outline.
     """
     n_pixels = int(np.count_nonzero(mask))
     candidates = np.linspace(0, n_pixels - 1, min(n_pixels, _CANDIDATES)).astype(np.intp)
@@ -159,13 +157,13 @@ def context_sample(lighting_at: LightingAt, mask: Bools) -> tuple[Tensor, Tensor
 def _is_covered(
     pixels: PixelIndices, brightest: Floats, mask: Bools, lighting_at: LightingAt
 ) -> Bools:
-    """Return which of some pixels (n,), whose largest observations are `brightest`, seem to be
-    fully covered.
+    """Return which pixels (n,), whose largest observations are `brightest`, seem to be fully
+    covered.
     """
     from cv2 import erode
 
     covered = np.ones(len(pixels), np.bool_)
-    # At the border of the image, the object continues.
+    # The object continues beyond the border of the image.
     inner = erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     rows, columns = PixelPlaces(mask).places(pixels)
     at_outline = np.flatnonzero(~inner[rows, columns])
@@ -187,25 +185,26 @@ def _is_covered(
 
 
 def float_tensors(*arrays: Floats) -> tuple[Tensor, ...]:
-    """Return 32-bit copies or views of arrays, whatever their strides, which tensors accept only
-    when positive.
+    """Return float32 tensors of arrays, copied if necessary, because tensors do not accept negative
+    strides.
     """
     return tuple(torch.from_numpy(np.ascontiguousarray(values, np.float32)) for values in arrays)
 
 
 ROTATION_SPAN_DEG = 20.0
-"""Range of the rotations of a network with a canonical azimuth. Training used up to 15 degrees
-either way.
+"""Range of the rotations for a network with a canonical azimuth. Training used up to 15 degrees in
+either direction.
 """
 
 
 class NetworkEstimator(_InBatches):
-    """LI-Net, then NE-Net (CNN-PS: NE-Net alone), on batches of pixels.
+    """LI-Net followed by NE-Net (for CNN-PS, NE-Net alone) on batches of pixels.
 
     `name` is the method's name in the registry, `precision` the number format of the convolutions,
-    and `rotations` the number of averaged estimates, see `rotations_of`. With `refines`, the
-    refinement net, if the weights have one, corrects the map afterwards. Memory grows with the
-    batch size, by about 0.25 MB a pixel. Raises UsageError if rotations or batch_size is below 1.
+    and `rotations` the number of estimates that are averaged (see `rotations_of`). With `refines`,
+    the map is then corrected by the refinement net, if the weights include one. Memory grows with
+    the batch size, by about 0.25 MB per pixel. Raises UsageError if rotations or batch_size is
+    below 1.
     """
 
     def __init__(
@@ -220,7 +219,7 @@ class NetworkEstimator(_InBatches):
         batch_size: int = 1024,
     ) -> None:
         if rotations < 1 or batch_size < 1:
-            raise UsageError("rotations and batch size are whole numbers from 1")
+            raise UsageError("rotations and the batch size must be whole numbers of at least 1")
         self.name = name
         self.weights: dict[str, str] = {"name": loaded.name, "sha256": loaded.sha256}
         self.device, self.precision, self.batch_size = str(device), str(precision), batch_size
@@ -232,8 +231,8 @@ class NetworkEstimator(_InBatches):
         self.needs_capture = self.refiner is not None or self.network.config.sees_capture
         self.fingerprint = f"{name} {loaded.sha256} {precision} {rotations} views"
         if self.network.config.sees_capture:
-            # Older trials used smaller contexts, with all pixels of the outline, and one context
-            # for all rotations.
+            # In earlier versions, contexts were smaller, included all pixels of the outline, and
+            # were shared by all rotations.
             self.fingerprint += f" with a context of up to {SAMPLE} pixels, outline {_COVERED}"
         if self.refiner is not None:
             self.fingerprint += (
@@ -243,20 +242,20 @@ class NetworkEstimator(_InBatches):
         self._rotations = rotations_of(rotations, canonical=loaded.network.config.is_canonical)
         self._contexts: list[CaptureContext | None] = [
             None
-        ] * rotations  # the capture's context in each rotation
+        ] * rotations  # the capture's context for each rotation
 
     @torch.no_grad()
     def bind(self, lighting_at: LightingAt, mask: Bools) -> NetworkEstimator:
-        """Return this estimator with the context of one capture, from a sample of its pixels; see
-        Estimator.
+        """Return this estimator with the context of one capture, computed from a sample of its
+        pixels; see Estimator.
 
-        Without it, each call of `estimate` treats its pixels as a capture of their own.
+        Without it, each call of `estimate` treats its pixels as a separate capture.
         """
         if not self.network.config.sees_capture or not mask.any():
             return self
         sample, lights = (values.to(self.device) for values in context_sample(lighting_at, mask))
         found = copy.copy(self)
-        # One thread, so that the number of threads does not change the rounding.
+        # Use one thread, so that the number of threads does not affect rounding.
         bfloat16 = torch.autocast(
             lights.device.type, dtype=torch.bfloat16, enabled=self.precision == "bfloat16"
         )
@@ -276,7 +275,8 @@ class NetworkEstimator(_InBatches):
     ) -> tuple[Float32Array, Float32Array]:
         """Estimate unit normals (P, 3) and the distributions (P, 2) of their errors; see Estimator.
 
-        The numbers of the distributions are means over the rotations, and 0 without an error head.
+        The parameters of the distributions are averaged over the rotations. They are 0 if the
+        network has no error head.
         """
         if self._contexts[0] is None and self.network.config.sees_capture and len(observations):
 
@@ -291,8 +291,8 @@ class NetworkEstimator(_InBatches):
         return results[:, :3], results[:, 3:]
 
     def _average_rotations(self, batch: Tensor, lights: Tensor) -> Tensor:
-        """Return normals and the distributions of their errors (P, 5). The latter are 0 without an
-        error head.
+        """Return normals and the distributions of their errors (P, 5), which are 0 without an error
+        head.
         """
         total = batch.new_zeros(len(batch), 5)
         with torch.autocast(
@@ -317,7 +317,7 @@ class NetworkEstimator(_InBatches):
         all_observations: Observations,
         all_directions: Float64Array,
     ) -> ObservationMaps | None:
-        """Return the network's input, LI-Net's output, and the maps of all observations; see
+        """Return the network's input, the output of LI-Net, and the maps of all observations; see
         Estimator.
         """
         network, config = self.network, self.network.config
@@ -346,17 +346,17 @@ class NetworkEstimator(_InBatches):
         )
 
     def warn_of_lights(self, n_lights: int) -> list[str]:
-        """Return a sentence if the weights were not trained with this number of lights."""
+        """Return a warning if the weights were not trained for this number of lights."""
         return untrained_warning(self.weights["sha256"], n_lights)
 
 
 def rotations_of(count: int, *, canonical: bool) -> list[Rotation]:
     """Return `count` rotations of the lights about the view axis.
 
-    A network without a canonical azimuth gets the angles 360 k / count, as CNN-PS does. Such angles
-    change nothing for a network with a canonical azimuth. It gets small angles across
-    ROTATION_SPAN_DEG, which move the lights over the borders of the cells, and each angle once more
-    with mirrored lights.
+    Without a canonical azimuth, a network uses the angles 360 k / count, as in CNN-PS. They would
+    have no effect on a network with a canonical azimuth, which instead uses small angles within
+    ROTATION_SPAN_DEG that move lights across the borders of cells, and each angle again with
+    mirrored lights.
     """
     if not canonical:
         return [Rotation(360.0 * k / count) for k in range(count)]

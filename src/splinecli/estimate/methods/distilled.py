@@ -1,11 +1,11 @@
-"""An estimator made for one capture: a perceptron that learned a network's normals on a sample of
+"""An estimator for a single capture: a perceptron trained on a network's normals for a sample of
 the pixels.
 
-One capture has one set of lights and a few materials, so most of its pixels are redundant. Under
-near lamps, the lights change smoothly over the image. The network estimates a sample of the pixels,
-and the perceptron learns from this sample and estimates the rest over 100 times as fast. The part
-that the perceptron does not reproduce is mostly the network's noise (Hinton, Vinyals and Dean,
-Distilling the knowledge in a neural network, arXiv 1503.02531).
+A capture has one set of lights, or lights that change smoothly over the image, and few materials,
+so most of its pixels are redundant. The network estimates a sample of the pixels. Trained on this
+sample, the perceptron estimates the rest over 100 times as fast. What it does not reproduce is
+mostly the network's noise (Hinton, Vinyals and Dean, Distilling the knowledge in a neural network,
+arXiv 1503.02531).
 """
 
 import itertools
@@ -41,27 +41,27 @@ from splinecli.maths.pixel_grid import slices
 from splinecli.system.machine import one_thread_each, side_by_side
 from splinecli.system.progress import Progress, ignore
 
-CELLS = 256  # number of groups of pixels of like appearance
-# Share of the sample that is drawn evenly from all pixels. The rest is drawn evenly from the
+CELLS = 256  # number of groups of pixels with similar appearance
+# Share of the sample that is drawn uniformly from all pixels. The rest is drawn evenly from the
 # groups.
 EVEN_SHARE = 0.5
 
 
 @dataclass(frozen=True)
 class PixelSample:
-    """A sample of pixels, and the appearances that it covers."""
+    """A sample of pixels and the appearances that it covers."""
 
-    # (N,) distinct numbers of the pixels. The first EVEN_SHARE are an even sample of all pixels
+    # (N,), distinct indices of the pixels. The first EVEN_SHARE are a uniform sample of all pixels
     rows: Tensor
-    # (K, C), the features at the centres of the groups, those of fewest pixels first
+    # (K, C), the features at the centres of the groups, the smallest groups first
     centres: Tensor
-    n_rare: int  # number of groups of few pixels
-    # the largest distance of a pixel, among those that could be drawn, from the nearest centre
+    n_rare: int  # number of groups considered rare
+    # largest distance of a candidate pixel from the nearest centre
     reach: float
 
     def unlike(self, features: Tensor) -> Tensor:
-        """Return which pixels (P,) with features (P, C) are in rare groups, or farther away than
-        any group reaches.
+        """Return which pixels (P,) with features (P, C) are in rare groups, or outside all
+        groups.
         """
         # Twice as fast as torch.cdist.
         products = torch.addmm(self.centres.square().sum(dim=1), features, self.centres.T, alpha=-2)
@@ -72,7 +72,7 @@ class PixelSample:
             else torch.full_like(squares, torch.inf)
             for part in (products[:, : self.n_rare], products[:, self.n_rare :])
         )
-        # Rounding must not make a pixel of the sample unlike itself.
+        # The tolerance keeps rounding errors from excluding pixels of the sample.
         return (from_rare < from_others) | (from_others > 1.001 * self.reach + 1e-4)
 
 
@@ -81,11 +81,11 @@ def draw_sample(
 ) -> PixelSample:
     """Draw a sample of `size` pixels, or half of all pixels if that is less.
 
-    The pixels are grouped around centres: each further centre is the pixel farthest from all
-    centres so far (Gonzalez, Clustering to minimize the maximum intercluster distance, 1985). Rare
-    appearances thereby get groups of their own. The features (P, C) are of the pixels that may be
-    drawn, and the generator is on the CPU. `rare_share` is the largest share of the pixels in
-    groups that are considered rare.
+    The pixels are grouped around centres, each of which is the pixel farthest from all previous
+    centres (Gonzalez, Clustering to minimize the maximum intercluster distance, 1985), so that rare
+    appearances get separate groups. The features (P, C) are of the candidate pixels, and the
+    generator is on the CPU. `rare_share` is the largest share of the pixels in groups that are
+    considered rare.
     """
     order = torch.randperm(len(features), generator=generator)
     size = min(size, len(features) // 2)
@@ -95,7 +95,7 @@ def draw_sample(
     by_count = torch.argsort(counts, stable=True)
     n_rare = int((counts[by_count].cumsum(0) <= rare_share * int(counts.sum())).sum())
     left = order[n_even:]
-    # One pixel of each group in turn, until there are enough.
+    # Take one pixel from each group in turn, until there are enough.
     turns = torch.argsort(_rank_in_group(nearest[left.to(nearest.device)].cpu()), stable=True)
     pixels = torch.cat((order[:n_even], left[turns[: size - n_even]]))
     return PixelSample(pixels, features[centres[by_count]], n_rare, reach)
@@ -130,19 +130,19 @@ def _rank_in_group(groups: Tensor) -> Tensor:
 
 BATCH = 256
 _LEARNING_RATE = 1e-2
-_WARM_UP = 0.1  # share of the steps in which the learning rate rises
-# Decay of the means of the gradient and of its square in Adam (arXiv 1412.6980)
+_WARM_UP = 0.1  # share of the steps during which the learning rate rises
+# Decay rates of Adam's means of the gradient and of its square (arXiv 1412.6980)
 _MOMENTUM, _SQUARES = 0.9, 0.99
-_ERROR_SHARE = 0.05  # of the loss of the errors in the loss
-_ROUNDED = 0.02  # radians; the loss is the angle, but quadratic below this one
+_ERROR_SHARE = 0.05  # weight of the errors in the loss
+_ROUNDED = 0.02  # radians; the loss is the angle, but becomes quadratic below this value
 
 
 class Perceptron(nn.Module):
-    """Corrects the least-squares normal of a pixel from its observations, in the capture's order of
-    lights.
+    """A network that corrects a pixel's least-squares normal from its observations in the capture's
+    order of lights.
 
-    The light directions are (F, 3), unit; or (P, F, 3) of some pixels, if near lamps give each its
-    own. The hidden layers are `width` wide. The generator draws the weights.
+    The unit light directions are (F, 3), or (P, F, 3) of some pixels if they differ because of near
+    lamps. The hidden layers are `width` wide. The weights are drawn with the generator.
     """
 
     solve: Tensor | None
@@ -174,11 +174,11 @@ class Perceptron(nn.Module):
         return parameters[::2], parameters[1::2]
 
     def inputs(self, observations: Tensor, light_directions: Tensor) -> Tensor:
-        """Return observations (P, F) scaled to a largest of 1, and least-squares normals: (P, F +
-        3).
+        """Return observations (P, F) scaled to a largest value of 1, followed by least-squares
+        normals, (P, F + 3).
 
-        The mean direction (P, 3) of lights (P, F, 3) is placed between them, because it encodes the
-        pixel's position.
+        For lights (P, F, 3), their mean direction (P, 3) is placed in between, because it encodes
+        the pixel's position.
         """
         scaled = observations / map_scale(observations)
         if self.solve is not None:
@@ -190,7 +190,8 @@ class Perceptron(nn.Module):
         """Return unit normals (P, 3) and the distributions of their errors (P, 2); see
         networks/li_ne_net.py.
 
-        For the inputs (P, C), see `inputs`. Only the hidden layers compute in bfloat16.
+        For the inputs (P, C), see `inputs`. With bfloat16, the last layer still computes in
+        float32.
         """
         scaled = (inputs - self.mean) / self.spread
         with torch.autocast(inputs.device.type, dtype=torch.bfloat16, enabled=bfloat16):
@@ -203,10 +204,10 @@ class Perceptron(nn.Module):
     def gradient(self, inputs: Tensor, normals: Tensor, errors: Tensor) -> list[Tensor]:
         """Return the gradients of the loss, in the order of `parameters`.
 
-        The loss is the mean angle to the normals (P, 3) of pixels with inputs (P, C), and not its
-        square, because the estimator's outliers must not draw the normals of other pixels, and
-        _ERROR_SHARE times the mean square difference from their errors (P, 2). Without autograd,
-        learning takes half of the time.
+        For pixels with inputs (P, C), the loss is the mean angle to the normals (P, 3), plus
+        _ERROR_SHARE times the mean square difference from the errors (P, 2). The angle is not
+        squared, so that the network's outliers do not affect the normals of other pixels. Without
+        autograd, training takes half of the time.
         """
         (*weights, last), (*biases, offset) = self._weights_and_biases()
         passed = [(inputs - self.mean) / self.spread]
@@ -241,15 +242,15 @@ class Perceptron(nn.Module):
         generator: torch.Generator,
         progress: Callable[[], object],
     ) -> None:
-        """Learn the normals (P, 3) and errors (P, 2) of pixels with inputs (P, C). Calls `progress`
-        after each step.
+        """Train on the normals (P, 3) and errors (P, 2) of pixels with inputs (P, C). Calls
+        `progress` after each step.
         """
         parameters = list(self.parameters())
         parameters[-1][3:] = errors.mean(dim=0)
         self.mean.copy_(inputs.mean(dim=0))
         self.spread.copy_(inputs.std(dim=0) + 1e-3)
         values = parameters_to_vector(parameters)
-        # Parts of the vector, which each step changes as a whole
+        # The parameters become views of the vector, which each step updates as a whole.
         vector_to_parameters(values, parameters)
         mean, square = torch.zeros_like(values), torch.zeros_like(values)
         order = torch.empty(0, dtype=torch.long)
@@ -270,49 +271,49 @@ class Perceptron(nn.Module):
 
 
 def _rate_share(done: float) -> float:
-    """Return the share of the learning rate after a share of the steps: it rises, and then falls
-    along a cosine.
+    """Return the factor of the learning rate after a share of the steps: a linear rise, then a
+    cosine decay.
     """
     return min(
         done / _WARM_UP, 0.5 + 0.5 * math.cos(math.pi * max(0.0, done - _WARM_UP) / (1 - _WARM_UP))
     )
 
 
-_CANDIDATES = 100_000  # pixels that the sample is drawn from
+_CANDIDATES = 100_000  # pixels from which the sample is drawn
 
-_TILE = 8192  # with fewer pixels at once, two cores often wait for each other
+_TILE = 8192  # with smaller tiles, cores often wait for each other
 
 
 @dataclass(frozen=True)
 class DistilledFrom:
-    """The learned perceptron, and how well it learned."""
+    """The training of a perceptron and the accuracy that it reached."""
 
-    sample: int  # number of pixels that the network estimated for learning
-    held_out: int  # number of these that were not learned. They are an even sample of the capture
-    # mean_deg, p95_deg: angles between perceptron and network on the pixels held out
+    sample: int  # number of pixels that the network estimated
+    held_out: int  # number of these not used for training, a uniform sample of the capture
+    # mean_deg, p95_deg: angles between the normals of perceptron and network for the held-out
+    # pixels
     mean_deg: float
     p95_deg: float
-    expected_deg: float  # the mean error that the network expects of itself on them
+    expected_deg: float  # the network's mean predicted error for the held-out pixels
 
     @property
     def is_good(self) -> bool:
-        """Whether the perceptron follows the network closely enough, compared with the network's
-        own errors.
+        """Whether the perceptron approximates the network closely enough, compared with the
+        network's own errors.
         """
-        # On rendered pixels, a larger share increased the error against the truth by 0.3 degrees or
-        # more.
+        # On rendered pixels, a larger factor increased the true error by 0.3 degrees or more.
         return self.mean_deg <= 0.7 * self.expected_deg
 
 
 class DistilledEstimator(Estimator):
-    """The perceptron for most pixels of a capture, and the network for rare and unlike ones; see
-    distil.
+    """The perceptron for most pixels of a capture, and the network for rare or dissimilar pixels;
+    see distil.
     """
 
     has_confidence = True
     needs_capture = True
     tile_pixels = 1 << 20
-    """The few rare pixels of a tile still fill several batches of the network."""
+    """Large enough for the few rare pixels of a tile to fill several batches of the network."""
 
     def __init__(
         self,
@@ -330,18 +331,18 @@ class DistilledEstimator(Estimator):
         self.fingerprint = f"{teacher.fingerprint} distilled from {found.sample} pixels"
 
     def rebind(self, lighting_at: LightingAt, mask: Bools) -> Estimator:
-        """Learn the capture again after its observations changed. Return the network if it cannot
-        be learned.
+        """Return a new perceptron for the changed observations, or the network if too few pixels
+        remain lit.
         """
         teacher = self._teacher.bind(lighting_at, mask)
         try:
             learned = distil(teacher, lighting_at, int(np.count_nonzero(mask)), self._size)
-        except UsageError:  # too few pixels are still lit
+        except UsageError:  # too few lit pixels
             return teacher
         return learned if learned.distillation.is_good else teacher
 
     def report(self) -> dict[str, Any]:
-        """Return how the capture was estimated so far, as JSON values."""
+        """Return how the capture has been estimated so far, as JSON values."""
         found = self.distillation
         return {
             "sample": found.sample,
@@ -365,7 +366,7 @@ class DistilledEstimator(Estimator):
         Estimator.
         """
         normals, errors = (np.empty((len(observations), columns), np.float32) for columns in (3, 2))
-        # The pixels that are rare, or unlike the sample
+        # The pixels that are rare or dissimilar to the sample
         unlike = np.empty(len(observations), np.bool_)
 
         def apply(rows: slice) -> slice:
@@ -404,23 +405,25 @@ def distil(
     """Return an estimator for one capture's pixels, trained on `teacher`'s normals for a sample of
     the pixels.
 
-    The result is the same for the same seed. The teacher has confidence, and is bound to the
-    capture; see Estimator.bind. `progress` is called with numbers of pixels; in all, twice the
-    pixels of the sample. Raises UsageError if too few pixels are lit for a sample of FEWEST_PIXELS.
+    Equal seeds give equal results. The teacher must have confidence and be bound to the capture;
+    see Estimator.bind. `progress` is called with numbers of pixels, which add up to twice the size
+    of the sample. Raises UsageError if too few pixels are lit for a sample of FEWEST_TO_DISTIL.
     """
     rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     light = lighting_at(np.sort(rng.choice(n_pixels, min(_CANDIDATES, n_pixels), replace=False)))
     lit = np.flatnonzero((light.observations > 0).any(axis=1))
     candidates = light.observations[lit]
     directions = directions_at(light.directions, lit)
-    if len(candidates) // 2 < FEWEST_TO_DISTIL:  # the sample is at most half of them
-        raise UsageError(f"{len(candidates)} pixels are lit, too few to distil the network")
+    if len(candidates) // 2 < FEWEST_TO_DISTIL:  # the sample contains at most half of them
+        raise UsageError(
+            f"only {len(candidates)} pixels are lit, which is too few to distil the network"
+        )
     lights = torch.as_tensor(directions, dtype=torch.float32)
     perceptron = Perceptron(lights, size.width, generator).to(teacher.device)
-    with torch.inference_mode(False):  # its tensors could not be changed in place outside of it
+    with torch.inference_mode(False):  # inference mode forbids updates in place
         inputs = _inputs(perceptron, candidates, directions, teacher.device)
-        # At most 0.5 % of the pixels, and half as many as the sample, are of rare kinds and go
-        # through the network.
+        # Rare pixels, which the network processes, are at most 0.5 % of all pixels and half as many
+        # as the sample.
         rare_share = min(0.005, 0.5 * size.sample / n_pixels)
         sample = draw_sample(inputs, size.sample, generator, rare_share=rare_share)
         pixels = sample.rows.numpy()
@@ -432,7 +435,7 @@ def distil(
             torch.as_tensor(np.asarray(values, np.float32), device=inputs.device)
             for values in taught
         )
-        held = round(len(inputs) / 8)  # the first pixels are an even sample of all
+        held = round(len(inputs) / 8)  # the first pixels are a uniform sample
         share = len(inputs) / size.steps
         done = 0.0
 

@@ -1,5 +1,5 @@
-"""The interface that every method of photometric stereo implements, and least squares; imported
-without PyTorch.
+"""The interface that every method of photometric stereo implements, and least squares. This module
+does not import PyTorch.
 
 LS: Lambertian least squares. R. J. Woodham, "Photometric method for determining surface orientation
 from multiple images", 1980.
@@ -24,23 +24,23 @@ if TYPE_CHECKING:
     from splinecli.maths.observation_map import Grid
 
 
-FEWEST_TO_DISTIL = 64  # the smallest sample that can be learned from
+FEWEST_TO_DISTIL = 64  # smallest sample from which a network can be distilled
 
 
 @dataclass(frozen=True)
 class StudentSize:
-    """The size of a distilled network, of its sample and of its training."""
+    """The size of a distilled network, of its training sample and of its training."""
 
     sample: int  # number of pixels that the network estimates
-    steps: int  # steps of learning
+    steps: int  # training steps
     width: int  # units in each hidden layer of the perceptron
 
 
 def student_sizes(n_pixels: int) -> tuple[StudentSize, StudentSize]:
     """Return the usual size for a capture of n_pixels, and the size to use if that is not enough.
 
-    The training visits each pixel of the sample about 20 times. With a sample half as large again,
-    the mean error of a rendered relief of 6 megapixels falls by less than 0.01 degrees.
+    Training visits each pixel of the sample about 20 times. A sample that is larger by half reduces
+    the mean error on a rendered relief of 6 megapixels by less than 0.01 degrees.
     """
     usual = min(round(10_000 * max(1.0, n_pixels / 100_000) ** 0.15), n_pixels // 4)
     larger = min(3 * usual, n_pixels // 2)
@@ -49,7 +49,7 @@ def student_sizes(n_pixels: int) -> tuple[StudentSize, StudentSize]:
     )
 
 
-Observations = Float32Array  # (P, F): linear, already divided by the light intensities
+Observations = Float32Array  # (P, F), linear, divided by the light intensities
 
 # (F, 3), or (P, F, 3) if near lamps give each pixel its own: unit vectors towards the lights; x
 # right, y up, z to the camera.
@@ -57,21 +57,21 @@ Directions = Floats
 
 
 def directions_at(light_directions: Directions, pixels: slice | Array) -> Directions:
-    """Return the light directions of some pixels: those that all pixels share,
-    or the pixels' own.
+    """Return the light directions of some pixels, which all pixels share or which differ from pixel
+    to pixel.
     """
     return light_directions if light_directions.ndim == 2 else light_directions[pixels]
 
 
-# Pixels that an estimator gets at once, unless it has a `tile_pixels` of its own
+# Pixels passed to an estimator at once, unless its `tile_pixels` differs
 TILE_PIXELS = 16_384
 
 
 class Estimator:
-    """A method that estimates the normals of pixels from their observations, and all hooks that a
+    """A method that estimates the normals of pixels from their observations, with all hooks that a
     method may have.
 
-    A method without a hook inherits the one that does nothing.
+    The default hooks do nothing.
 
     name: the method's name in the registry. weights: name and SHA-256 of its weights, or None if it
     has none. device, precision: where and in which number format it computes; the report states
@@ -101,10 +101,10 @@ class Estimator:
     ) -> Floats:
         """Estimate unit normals (P, 3); x right, y up, z to the camera.
 
-        A pixel that is dark under every light has no normal. It gets (0, 0, 1). The observations
+        A pixel that is black under every light has no normal and gets (0, 0, 1). The observations
         are (P, F), the light directions (F, 3) or (P, F, 3). `progress` is called after each batch
-        with the number of its pixels. A method without confidence overrides this, all others
-        estimate_with_error.
+        with its number of pixels. Methods without confidence override this function, all others
+        override estimate_with_error.
         """
         return self.estimate_with_error(observations, light_directions, progress=progress)[0]
 
@@ -117,8 +117,9 @@ class Estimator:
     ) -> tuple[Floats, Floats | None]:
         """Estimate normals (P, 3) as `estimate` does, and the distributions (P, 2) of their errors.
 
-        The latter are None without confidence. networks/li_ne_net.py describes the two numbers. A
-        pixel that is dark under every light gets UNKNOWN_ERROR.
+        The distributions are None for methods without confidence. Their two parameters are
+        described in networks/li_ne_net.py. A pixel that is black under every light gets
+        UNKNOWN_ERROR.
         """
         return self.estimate(observations, light_directions, progress=progress), None
 
@@ -126,13 +127,13 @@ class Estimator:
         """Return the estimator for one capture, possibly with an encoded sample of its pixels as
         context.
 
-        `lighting_at` gives the observations and the light directions of some of the pixels of the
-        mask (H, W).
+        `lighting_at` returns the observations and light directions of given pixels of the mask
+        (H, W).
         """
         return self
 
     def rebind(self, lighting_at: LightingAt, mask: Bools) -> Estimator:
-        """Return the estimator, made by `bind`, for the same capture with other observations."""
+        """Return the estimator, which `bind` made, for the same capture with other observations."""
         return self.bind(lighting_at, mask)
 
     def observation_maps(
@@ -142,20 +143,20 @@ class Estimator:
         all_observations: Observations,
         all_directions: Float64Array,
     ) -> ObservationMaps | None:
-        """Return the observation maps of some pixels, or None for a method without them.
+        """Return the observation maps of pixels, or None if the method has none.
 
-        The observations (P, F) and (P, F') are of the same pixels, under directions (F, 3) and (F',
-        3).
+        The observations (P, F) and (P, F') are of the same pixels, under light directions (F, 3)
+        and (F', 3).
         """
         return None
 
     def warn_of_lights(self, n_lights: int) -> list[str]:
-        """Return a sentence if the method is not made for this number of lights."""
+        """Return a warning if the method is not suitable for this number of lights."""
         return []
 
 
 class ObservationMaps(NamedTuple):
-    """Observation maps (P, w, w) in the pixels' own frames, relative to the largest observation;
+    """Observation maps (P, w, w) in the frames of the pixels, relative to the largest observation,
     NaN in empty cells.
     """
 
@@ -167,11 +168,14 @@ class ObservationMaps(NamedTuple):
 
 CONFIDENT_DEG = 5.0  # confidence is the probability that a normal is off by at most this angle
 
-UNKNOWN_ERROR = (math.log(math.pi), math.log(30.0))  # of an unknown normal, whose confidence is 0
+UNKNOWN_ERROR = (
+    math.log(math.pi),
+    math.log(30.0),
+)  # without a normal; its confidence is 0
 
 
 def confident_share(errors: Floats) -> Float32Array:
-    """Return the probability (P,) that an error is at most CONFIDENT_DEG, from its distributions
+    """Return the probabilities (P,) that errors are at most CONFIDENT_DEG, from their distributions
     (P, 2).
     """
     import torch
@@ -183,12 +187,12 @@ def confident_share(errors: Floats) -> Float32Array:
     )
 
 
-TOWARDS_CAMERA = (0.0, 0.0, 1.0)  # the normal of a pixel that is dark under every light
+TOWARDS_CAMERA = (0.0, 0.0, 1.0)  # the normal of a pixel that is black under every light
 
 
 class LeastSquares(Estimator):
-    """Minimise |I - L b| over all observations, including shadows; n = b / |b|. In float64 on the
-    CPU.
+    """Least squares over all observations, including shadows: minimise |I - L b|, n = b / |b|.
+    Computes in float64 on the CPU.
     """
 
     name = fingerprint = "ls"
