@@ -100,10 +100,10 @@ def test_windows_in_words():
 @parametrize(
     "crop, scale, problem",
     [
-        ("1,2,3", None, "--crop is '1,2,3', expected X,Y,W,H"),
+        ("1,2,3", None, "--crop is '1,2,3'; expected X,Y,W,H"),
         ("-1,0,5,5", None, "--crop is"),
         ("0,0,0,5", None, "--crop is"),
-        (None, "4", "--scale is '4', expected 1/N"),
+        (None, "4", "--scale is '4'; expected 1/N"),
         (None, "1/0", "--scale is"),
         (None, "0.5", "--scale is"),
     ],

@@ -80,7 +80,7 @@ def test_positions_need_the_camera(run):
     result = run(
         f"calibrate one two {circles}",
         says=(
-            "the lamps' distances are unknown, so the lamps are treated as distant",
+            "the distances of the lamps are unknown, so the lamps are treated as distant",
             "warning: The lamps' distances are unknown, because the camera is",
         ),
     )

@@ -322,9 +322,7 @@ def test_folders_that_cannot_be_written_do_not_end_a_batch(
     lines = run_without_privileges(call, *names, code=5).out.splitlines()
     found = {document["capture"]: document for document in map(json.loads, lines)}
     assert (found["closed"]["exit_code"], found["file"]["exit_code"]) == (5, 5)
-    assert found["closed"]["error"].startswith(
-        "out/closed: no permission to write into this folder"
-    )
+    assert found["closed"]["error"].startswith("out/closed: no permission to write to this folder")
     assert found["good"] == read_report("good")
 
 

@@ -326,7 +326,7 @@ def test_a_surface_that_cannot_be_is_refused_before_the_work(capture, run, monke
     mask = np.zeros((24, 24), np.uint8)
     mask[8:16, 12] = 255  # a line
     write_image("line.png", mask)
-    says = "sphere: the mesh has no triangles", "or leave --surface out"
+    says = "sphere: the mesh has no triangles", "or omit --surface"
     run(f"infer {capture} --method ls --mask line.png --surface", input_error=says)
     assert not Path("out/sphere/report.json").exists()
 

@@ -175,7 +175,7 @@ def test_a_limit_on_open_files(folder):
 
 
 BUSY = (
-    "splinecli: out/a: another splinecli process is writing to this folder. Wait until it is"
+    "splinecli: out/a: another splinecli process is writing to this folder. Wait until it has"
     " finished, or choose another -o.\n"
 )
 
@@ -213,4 +213,4 @@ def test_an_output_folder_without_permission(folder):
     for command in ("infer a --method ls", "integrate out/a", "calibrate a --circle 30,30,20"):
         done = shell(f"{prefix}{COMMAND} {command} -o closed -q", cwd=folder)
         assert done.returncode == 5, done.stderr
-        assert done.stderr.startswith("splinecli: closed: no permission to write into this folder")
+        assert done.stderr.startswith("splinecli: closed: no permission to write to this folder")

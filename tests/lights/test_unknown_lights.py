@@ -109,9 +109,9 @@ def test_what_shows_no_object_is_refused():
         (
             np.repeat(observed(lights(1)), 6, axis=1) * np.linspace(0.5, 1, 6),
             INSIDE,
-            "all images are alike",
+            "all images look the same",
         ),
-        (np.zeros((n_pixels, 8)), INSIDE, "all images are alike"),
+        (np.zeros((n_pixels, 8)), INSIDE, "all images look the same"),
         (rng.uniform(size=(n_pixels, 8)), INSIDE, "do not show one surface"),
         (shade(normals[ring], lights()), ring, "the mask is too thin"),
     ):

@@ -70,5 +70,5 @@ def test_a_decimated_mesh():
 def test_a_surface_without_triangles():
     line = np.zeros(SHAPE, bool)
     line[5] = True
-    with refuses("or leave --solid out"):
+    with refuses("or omit --solid"):
         close_mesh(surface_mesh(WAVE, line), 1.0, perspective=False)

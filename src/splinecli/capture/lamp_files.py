@@ -137,8 +137,8 @@ class LampFiles:
         return text if self.lobes is None else f"{text}; lobes as in {self.lobes}"
 
     def over(self, source: Lit, mask: Bools, *, step: int = 1) -> NearLamps | None:
-        """Return all lamps for a mask (H, W) of every step-th row and column; None if the scale is
-        unknown.
+        """Return all lamps for a mask (H, W) of every step-th row and column, or None if the scale
+        is unknown.
 
         Raises InputError.
         """

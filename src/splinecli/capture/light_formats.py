@@ -343,8 +343,7 @@ def _read_opencv(path: Path) -> dict[str, Float64Array]:
             found[name] = values.reshape(int(rows), int(columns))
         except ValueError:
             raise InputError(
-                f"the matrix {name} is damaged, because it does not contain {rows} x {columns}"
-                " numbers",
+                f"the matrix {name} is damaged and does not contain {rows} x {columns} numbers",
                 path,
             ) from None
     return found

@@ -101,14 +101,14 @@ def parse_window(crop: str | None, scale: str | None) -> Window:
         box = tuple(int(number) for number in found[0].split(",")) if found else ()
         if not box or not box[2] or not box[3]:
             problem = (
-                f"--crop is {crop!r}, expected X,Y,W,H, the upper left corner and the size in"
+                f"--crop is {crop!r}; expected X,Y,W,H, the upper left corner and the size in"
                 " pixels"
             )
             raise UsageError(problem, hint="For example, --crop 1000,500,800,600")
     found = re.fullmatch(r"1(?:/(\d{1,3}))?", "1" if scale is None else scale.replace(" ", ""))
     step = int(found[1] or 1) if found else 0
     if not step:
-        raise UsageError(f"--scale is {scale!r}, expected 1/N, such as 1/4")
+        raise UsageError(f"--scale is {scale!r}; expected 1/N, such as 1/4")
     return Window(box, step)
 
 

@@ -114,7 +114,7 @@ class ImageValues(NamedTuple):
 
     # the largest value that the file can store; None for floating-point images
     full_scale: int | None
-    stated: int | None  # the white level that the file states; None if it states none
+    stated: int | None  # the white level stated in the file, or None
     # the pixels at the given white level or above, or at full scale if none is given
     saturated: Integers
     maximum: int = 0  # the largest value of a 16-bit image; 0 for other images
@@ -142,7 +142,7 @@ class Saturation:
 
     @property
     def white_level(self) -> WhiteLevel | None:
-        """The white level; None for floating-point images, which have none."""
+        """The white level, or None for floating-point images, which have none."""
         return self._decision[0]
 
     @cached_property

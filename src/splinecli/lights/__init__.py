@@ -1,3 +1,3 @@
-"""Estimation, refinement and calibration of lights, and the light that reaches each pixel: near
-lamps and interreflection.
+"""Estimation, refinement and calibration of lights, and the light that reaches each pixel from near
+lamps and by interreflection.
 """

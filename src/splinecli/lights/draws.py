@@ -55,6 +55,6 @@ def _draw(light_directions: Float64Array, n_lights: int, trial: int, seed: int) 
         if not in_one_plane(light_directions[chosen]):
             return tuple(chosen.tolist())
     raise InputError(
-        f"the lights of all 1000 draws of {n_lights} lights are in one plane",
-        hint="Choose more lights, or lights that surround the viewing direction",
+        f"in all 1000 draws of {n_lights} lights, the lights are coplanar",
+        hint="Choose more lights, or lights all around the viewing direction",
     )

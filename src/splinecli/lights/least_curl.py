@@ -30,8 +30,8 @@ OPPOSITE = np.array((-1.0, -1.0, 1.0))
 def normal_derivatives(normals: Floats, mask: Bools, *, most: int) -> Float64Array | None:
     """Return normals and their derivatives to the right and upwards (3, p, 3).
 
-    There are at most `most` pixels, all with neighbours; None for fewer than 50. The normals (H, W,
-    3) in a mask (H, W) may have any length.
+    At most `most` pixels are returned, all with neighbours, or None if there are fewer than 50. The
+    normals (H, W, 3) in a mask (H, W) may have any length.
     """
     inside = binary_erosion(mask)
     if np.count_nonzero(inside) < 50 or min(mask.shape) < 2:
@@ -68,12 +68,12 @@ def curl_terms(
 
     p_x, p_y, q_x, q_y = slope(right, 0), slope(up, 0), slope(right, 1), slope(up, 1)
     curl, size = np.abs(p_y - q_x), np.sqrt(p_x**2 + p_y**2 + q_x**2 + q_y**2)
-    # At the edges of the object, both are huge.
+    # Both are huge at the edges of the object.
     largest = np.quantile(size, 0.95, axis=1, keepdims=True)
     weights = counts * facing**3
     found = weights * np.minimum(curl, largest)
     found /= np.maximum((weights * np.minimum(size, largest)).sum(axis=1, keepdims=True), 1e-12)
-    # Otherwise, a matrix could reduce the curl by turning normals away from the camera.
+    # Otherwise, a matrix could reduce the curl by rotating normals away from the camera.
     return np.where(counts.mean(axis=1, keepdims=True) >= least_share, found, np.inf)
 
 
@@ -113,11 +113,11 @@ def lights_of_least_curl(
     *,
     intensities_known: bool,
 ) -> list[Lights]:
-    """Return lights that explain the images of a matte surface by normals with little curl, best
-    first.
+    """Return lights that explain the images of a matte surface with normals of little curl, the
+    best first.
 
-    Each is the result of a search from another start, so some may be equal. The list is empty if
-    too few pixels are lit. The observations (P, F) are linear, divided by known intensities. The
+    Each is the result of a search from a different start, so some may be equal. The list is empty
+    if too few pixels are lit. The observations (P, F) are linear, divided by known intensities. The
     mask (H, W) has P true pixels, in row-major order. The guess has a low weight; `errors_deg` (F,)
     are its expected errors.
     """
@@ -209,7 +209,7 @@ class _Images:
 
     @property
     def unit_residual(self) -> float:
-        """How much the lengths of the lights deviate from 1 after fitting the metric."""
+        """The deviation of the lengths of the lights from 1 after the metric is fitted."""
         lengths = np.linalg.norm(self.factors @ _root_of_metric(self.factors), axis=1)
         return float(np.abs(lengths**2 - 1).mean())
 

@@ -188,7 +188,7 @@ _GATHERED = 500_000
 def find_indirect_light(
     mask: Bools, observations: Float32Array, lighting_at: LightingAt, normals: Float32Array
 ) -> IndirectLight | None:
-    """Return the indirect light of a capture; None if attached shadows show none that can be
+    """Return the indirect light of a capture, or None if attached shadows show none that can be
     removed.
 
     The camera is always treated as orthographic, because only nearby parts exchange much light. The
@@ -282,10 +282,10 @@ def _exposure(
     normals: Float32Array,
     step: int,
 ) -> float | None:
-    """Return the factor from albedos in the unit of the observations to true albedos.
+    """Return the factor from albedos in the unit of the observations to true albedos, or None.
 
-    None without visible indirect light. The factor is fitted to attached shadows, together with
-    uniform ambient light. In a round bowl under a ring of lights, indirect light is just as
+    It is None if no indirect light is visible. The factor is fitted to attached shadows, together
+    with uniform ambient light. In a round bowl under a ring of lights, indirect light is just as
     uniform, and the fit attributes it to the indirect part. The albedo is known at every `step`-th
     pixel.
     """

@@ -1,4 +1,4 @@
-"""The outline of the object, and the common rotation of lights and normals that it reveals.
+"""Find the outline of the object, and the common rotation of lights and normals that it reveals.
 
 Where a smooth surface curves away from the camera, its normals are perpendicular to the viewing
 direction and to the outline. If all lights are rotated, so are all estimated normals, including the
@@ -39,7 +39,8 @@ class OutlineTurn(NamedTuple):
 def turn_at_outline(
     observations: Floats, mask: Bools, light_directions: Float64Array
 ) -> OutlineTurn | None:
-    """Return the rotation of the lights that the outline reveals; None if too few pixels show it.
+    """Return the rotation of the lights that the outline reveals, or None if too few pixels show
+    it.
 
     The border of the image is ignored. The observations (P, F) are linear, divided by the light
     intensities. The mask (H, W) has P true pixels, in row-major order, and the directions (F, 3)
@@ -69,8 +70,8 @@ def turn_at_outline(
 
 
 def is_outlined(mask: Bools) -> bool:
-    """Return whether a mask (H, W) contains the outline of the object, which then fits into the
-    image.
+    """Return whether a mask (H, W) contains the outline of the object, so that the object fits into
+    the image.
     """
     return outline_share(mask) >= 0.5
 

@@ -87,7 +87,7 @@ class RoughNormals:
     ) -> tuple[tuple[Float64Array, Float64Array], tuple[Float64Array, Float64Array]] | None:
         """Return the derivatives (n,) of both slopes to the right and upwards at inner pixels.
 
-        None for too few pixels.
+        Return None if there are too few pixels.
         """
         from scipy.ndimage import binary_erosion
 
@@ -289,7 +289,7 @@ class ShadowCheck:
 
 
 def cast_shadows(heights: Float64Array, lights: Float64Array) -> Bools:
-    """Return where a surface shades itself (h, w, F), for lights (F, 3).
+    """Return where a surface casts shadows on itself (h, w, F) under lights (F, 3).
 
     The heights (h, w) are in pixels, NaN outside the object.
     """
@@ -303,7 +303,7 @@ def cast_shadows(heights: Float64Array, lights: Float64Array) -> Bools:
     cast = np.zeros((height, width, len(lights)), np.bool_)
     for place, (x, y, z) in enumerate(lights):
         level = float(np.hypot(x, y))
-        # A ray that has risen by the whole relief cannot be blocked any more.
+        # A ray that has risen above the whole relief can no longer be blocked.
         longest = (
             max(height, width) if z <= 0 else min(max(height, width), int(relief * level / z) + 1)
         )

@@ -1,4 +1,4 @@
-"""Lights from the images of the object alone (uncalibrated photometric stereo).
+"""Estimate lights from the images of the object alone (uncalibrated photometric stereo).
 
 The shading of a matte surface leaves its lights ambiguous, so other evidence has to decide. A bump
 looks like a hollow under lights with x and y negated: shading, attached shadows, highlights and the
@@ -9,8 +9,8 @@ ambiguity", IJCV 1999), but it makes the albedo depend on the slope.
 
 The outline of the object reveals a common rotation of lights and normals; see outline.py.
 
-The lights are found in three steps. The light network guesses each light from shading, shadows and
-outline, and predicts the error of its guess. Since a matte surface under F lights has images of
+The lights are estimated in three steps. The light network guesses each light from shading, shadows
+and outline, and predicts the error of its guess. Since a matte surface under F lights has images of
 rank 3 (Hayakawa, JOSA A 1994) and its normals have no curl, least_curl.py finds further candidates.
 Starting from these and from lights near the guess, estimate/light_descent.py searches for lights
 under which the network that estimates normals predicts the smallest errors. Cast shadows and the
@@ -221,9 +221,12 @@ def _fit(
     if refuse and fit is not None and fit.after > 0.08:
         problem = (
             "the images do not show one surface under different distant lights, so the lights"
-            " cannot be found"
+            " cannot be estimated"
         )
-        hint = "Check that camera and object stood still, and that all images show the same object"
+        hint = (
+            "Check that the camera and the object did not move, and that all images show the same"
+            " object"
+        )
         raise InputError(problem, hint=hint)
     if fit is not None and fit.after < fit.before and (fit.directions[:, 2] > 0).all():
         directions, intensities = fit.directions, intensities * fit.intensities
@@ -328,7 +331,7 @@ def _check_different(observations: Float32Array) -> None:
     rows = rows / np.maximum(rows.mean(axis=0), 1e-12)
     mean = rows.mean(axis=1, keepdims=True)
     if np.abs(rows - mean).mean() <= 0.01 * mean.mean():  # both are zero for black images
-        problem = "all images are alike, so they do not determine the lights"
+        problem = "all images look the same, so they do not determine the lights"
         raise InputError(problem, hint="Move the lamp to another place for each photograph")
 
 
@@ -348,7 +351,7 @@ def _ask_network(
         small.append(cut[0])
     if not inside.any():
         raise InputError(
-            "the mask is too thin or too scattered to find the lights",
+            "the mask is too thin or too scattered to estimate the lights",
             hint="Pass a mask of the whole object",
         )
     images = torch.stack(small)

@@ -1,3 +1,3 @@
-"""Base colour, roughness, metalness and specular reflection of each pixel, from images, lights and
-normals.
+"""Estimate the base colour, roughness, metalness and specular reflection of each pixel from images,
+lights and normals.
 """

@@ -1,4 +1,6 @@
-"""The gloss of each pixel from the material net: all parameters of the material except the base."""
+"""Estimate the gloss of each pixel, all parameters of the material except the base, with the
+material net.
+"""
 
 from __future__ import annotations
 

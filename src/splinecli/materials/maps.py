@@ -1,5 +1,5 @@
-"""Maps of a capture's material, from its images, lights and normals, and pictures under other
-lights.
+"""Estimate maps of a capture's material from its images, lights and normals, and render it under
+other lights.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from splinecli.maths.pixel_grid import on_map
 from splinecli.records.output_files import MAPS
 from splinecli.surface.integration import integrate_normals
 
-_LIT = 0.05  # smallest n.l of a light that is used, which excludes the rounded rim of a shadow
+_LIT = 0.05  # smallest n.l of a light that is used, to exclude the soft edge of a shadow
 _BRIGHT_QUANTILE = 0.95
 _SMOOTH = 4.0  # standard deviation in pixels of the smoothing of the trust
 # Mean reflectance of dielectrics at normal incidence, which determines the exposure

@@ -1,4 +1,4 @@
-"""Short names for the types of arrays in signatures; docstrings give their shapes."""
+"""Short names for array types in signatures. Docstrings state the shapes."""
 
 from typing import Any
 
@@ -12,4 +12,4 @@ Indices = NDArray[np.intp]
 Floats = NDArray[np.floating]  # of any precision
 Float32Array = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]  # RGB (H, W, 3) or gray (H, W), of 8 bits
+Picture = NDArray[np.uint8]  # 8-bit RGB (H, W, 3) or gray (H, W)

@@ -1,9 +1,8 @@
-"""Unit normals: their length, angles and errors in degrees, their pictures, and slopes and
-curvatures.
+"""Functions of unit normals: length, angles and errors in degrees, pictures, slopes and curvatures.
 
 Frame: x right, y up, z to the camera (docs/files-and-frames.md).
 
-Slopes and curvatures are computed without integration, so there is no drift and there are no tears.
+Slopes and curvatures are computed without integration, so they are not affected by drift or tears.
 For a surface z(x, y) with unit normals n = (-p, -q, 1) / sqrt(1 + p^2 + q^2), let J be the matrix
 of the derivatives of (nx, ny) with respect to x and y. Its determinant is the Gaussian curvature,
 because normals rotate as much as the surface does (Gauss), and half its trace is the mean curvature
@@ -20,8 +19,8 @@ from splinecli.maths import Bools, Float32Array, Float64Array, Floats
 
 Convention = Literal["opengl", "directx"]
 
-# The background of a picture may be gray, which stands for the zero vector. Normals are longer than
-# this.
+# Shortest vector of a normal in a picture, whose background may be gray, which represents the zero
+# vector
 SHORTEST_IN_PICTURE = 0.5
 _Float = TypeVar("_Float", bound=np.floating)
 
@@ -36,8 +35,8 @@ def unit(vectors: NDArray[_Float]) -> NDArray[_Float]:
 
 
 def spread_of(normals: Floats) -> float:
-    """Return the second largest standard deviation of unit normals (P, 3), small for a flat
-    object.
+    """Return the second largest standard deviation of unit normals (P, 3), which is small for a
+    flat object.
     """
     return float(np.sqrt(np.linalg.eigvalsh(np.cov(normals.T))[1]))
 
@@ -62,7 +61,7 @@ def encode_picture(
     bits: int = 16,
     convention: Convention = "opengl",
 ) -> NDArray[np.unsignedinteger]:
-    """Return a normal map (H, W, 3) as an RGB image of 8 or 16 bits, black outside the mask (H, W).
+    """Return a normal map (H, W, 3) as an 8- or 16-bit RGB image, black outside the mask (H, W).
 
     A component n becomes (n + 1) / 2 of full scale. Green points up with "opengl" and down with
     "directx".
@@ -77,13 +76,13 @@ def encode_picture(
 
 
 def describe(convention: Convention) -> str:
-    """Return the description for normal map files: the frame, and the direction of green."""
+    """Return the description stored in normal map files: the frame, and the direction of green."""
     green = "up" if convention == "opengl" else "down"
     return f"x right, y up, z to the camera; green is y {green}"
 
 
 def decode_picture(picture: NDArray[np.unsignedinteger]) -> Float64Array:
-    """Return unit normals for an RGB image (..., 3) of 8 or 16 bits, green up.
+    """Return unit normals from an 8- or 16-bit RGB image (..., 3) whose green points up.
 
     Black and middle gray become zero vectors.
     """
@@ -122,7 +121,7 @@ def angular_error_map_deg(normals: Floats, ground_truth: Floats, mask: Bools) ->
 
 
 def summarise_errors(errors_deg: Floats) -> AngularErrors | None:
-    """Return the statistics of angular errors in degrees of any shape, ignoring NaN; None if all
+    """Return the statistics of angular errors in degrees of any shape, ignoring NaN, or None if all
     are NaN.
     """
     errors = errors_deg[np.isfinite(errors_deg)].astype(np.float64)
@@ -168,8 +167,8 @@ def _derivatives(
     """Return the derivatives (H, W) of values with respect to x (right) and y (up).
 
     They are the slopes of planes fitted to the values in the mask with Gaussian weights, computed
-    from moments, which are derivatives of Gaussians. Away from the mask's edge, they are equal to
-    the derivatives of the filtered values. At the edge, these would be too small.
+    from moments, which are derivatives of Gaussians. Away from the edge of the mask, they equal the
+    derivatives of the filtered values, which would be too small at the edge.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -186,7 +185,7 @@ def _derivatives(
     right, down, value = (
         moment(*m) / weight for m in ((inside, 0, 1), (inside, 1, 0), (inner, 0, 0))
     )
-    least = 1e-3 * sigma**2  # for masks that are lines
+    least = 1e-3 * sigma**2  # for masks one pixel wide
     rr = moment(inside, 0, 2) / weight - right**2 + least
     dd = moment(inside, 2, 0) / weight - down**2 + least
     rd = moment(inside, 1, 1) / weight - right * down

@@ -1,5 +1,5 @@
-"""Observation maps: the observations of one pixel as an image, placed by the directions of their
-lights.
+"""Observation maps: the observations of one pixel as an image, placed according to the light
+directions.
 
 A map is a square of `size` x `size` cells over the plane (x, y), the orthographic projection of
 light directions, from -1 to 1 in both axes. Column 0 is x = -1 and row 0 is y = +1, so y points up
@@ -8,8 +8,8 @@ the common corner of the four middle cells. Therefore, rotations by 90 degrees a
 exact permutations of cells.
 
 CNN-PS (Ikehata, ECCV 2018) and SPLINE-Net (Zheng et al., ICCV 2019) use floor((size - 1)(x + 1) /
-2), whose last cell is a single point. On average, this differs from ours by half a cell, nearly two
-degrees. Networks that were trained on such maps need the same grid, "cnn-ps".
+2), so their last cell is a single point. On average, this differs from our grid by half a cell, or
+nearly two degrees. Networks that were trained on such maps need the same grid, "cnn-ps".
 """
 
 from functools import lru_cache
@@ -21,13 +21,14 @@ from torch import Tensor
 MAP_SIZE = 32
 
 Grid = Literal["even", "cnn-ps"]
-"""The rule that assigns lights to cells: ours, or that in CNN-PS and SPLINE-Net. Row 0 is y = +1 in
-both."""
+"""The rule that assigns lights to cells: our rule, or the rule of CNN-PS and SPLINE-Net. Row 0 is y
+= +1 in both.
+"""
 
 
 class SparseMap(NamedTuple):
-    """Values (P, C, size, size), zero in empty cells, and occupied (P, 1, size, size), one in the
-    others.
+    """Values (P, C, size, size), zero in empty cells, and occupied (P, 1, size, size), one in all
+    other cells.
     """
 
     values: Tensor
@@ -51,12 +52,12 @@ def light_cells(light_directions: Tensor, size: int = MAP_SIZE, grid: Grid = "ev
 
 @lru_cache(maxsize=8)
 def cell_directions(size: int = MAP_SIZE) -> tuple[Tensor, Tensor]:
-    """Return the light directions at the centres of the cells (size, size, 3), and the mask of the
-    disc.
+    """Return the light directions (size, size, 3) at the centres of the cells, and the mask
+    (size, size) of the disc.
 
-    No light can be in a cell outside the disc (size, size). Its direction is a zero vector.
+    Cells outside the disc cannot contain a light. Their directions are zero vectors.
     """
-    # The result is cached, so it must not depend on a default device.
+    # The result is cached, so it must not depend on the default device.
     centre = (torch.arange(size, dtype=torch.float64, device="cpu") + 0.5) * (2 / size) - 1
     y, x = torch.meshgrid(-centre, centre, indexing="ij")
     z_squared = 1 - x**2 - y**2
@@ -105,8 +106,8 @@ def sparse_map(
 
 
 def map_scale(observations: Tensor, valid: Tensor | None = None) -> Tensor:
-    """Return the largest valid observation of each pixel (P, 1), which scales its maps; 1 for a
-    black pixel.
+    """Return the largest valid observation (P, 1) of each pixel, by which its maps are scaled, or 1
+    for a black pixel.
     """
     if valid is not None:
         observations = observations * valid

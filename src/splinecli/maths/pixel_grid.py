@@ -22,7 +22,7 @@ from splinecli.maths import Array, Bools, Float32Array, Float64Array, Floats, In
 Places = NDArray[np.number[Any]]
 Value = TypeVar("Value", bound=np.generic)
 
-# Largest number in a camera matrix. With larger ones, integration overflows or is singular.
+# Largest number in a camera matrix. Larger numbers would make integration overflow or singular.
 _LARGEST = 1e6
 
 
@@ -56,7 +56,7 @@ def pixel_rays(mask: Bools, camera_matrix: Floats) -> Float64Array:
 
 
 def rays_at(rows: Places, columns: Places, camera_matrix: Floats) -> Float64Array:
-    """Return the points (N, 3) as in pixel_rays for image rows and columns (N,). Raises the same
+    """Return points (N, 3) as in pixel_rays for image rows and columns (N,). Raises the same
     errors.
     """
     image = np.stack((columns, rows, np.ones(len(rows))), axis=1).astype(np.float64)
@@ -86,7 +86,7 @@ def focal_length(camera_matrix: Floats) -> float:
 
 
 def ray_basis(camera_matrix: Floats) -> Float64Array:
-    """Return the matrix (3, 3) by which an image point (column, row, 1) is multiplied to get its
+    """Return the matrix (3, 3) by which an image point (column, row, 1) is multiplied to obtain its
     ray.
 
     The first row is the step of a ray from one column to the next, the second the step from one row
@@ -147,7 +147,7 @@ class Blocks:
         return (sums / np.bincount(block)[:, None]).astype(values.dtype)
 
     def shrink_camera(self, camera_matrix: Floats | None) -> Floats | None:
-        """Return the camera matrix in blocks from the matrix in pixels; None for an orthographic
+        """Return the camera matrix in blocks from the matrix in pixels, or None for an orthographic
         camera.
         """
         if camera_matrix is None:
@@ -174,8 +174,8 @@ class Blocks:
         return number[rows // self.step, columns // self.step]
 
     def spread(self, values: Array) -> Array:
-        """Return a map (h, w, ...) of the blocks' values (p, ...). Other cells copy the nearest
-        block.
+        """Return a map (h, w, ...) of the blocks' values (p, ...). Cells without a block copy the
+        nearest one.
         """
         from scipy.ndimage import distance_transform_edt
 

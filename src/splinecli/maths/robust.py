@@ -1,5 +1,5 @@
-"""Robust Lambertian fits in NumPy by weighted least squares, and the closed form of 3 x 3 systems
-for all fits.
+"""Robust Lambertian fits in NumPy by weighted least squares, and the closed-form solution of 3 x 3
+systems for all fits.
 
 `inverse_3x3` works on both NumPy arrays and torch tensors. It limits its pivots from below, so that
 the result remains positive definite.
@@ -19,8 +19,7 @@ SMALLEST_PIVOT = 1e-12
 
 
 def inverse_3x3(entries: Sequence[Any], smallest: float) -> tuple[Any, ...]:
-    """Return the inverses of symmetric positive matrices in the form xx, yy, zz, xy, xz, yz, each
-    (P,).
+    """Return the inverses of symmetric positive matrices as xx, yy, zz, xy, xz, yz, each (P,).
 
     The input has the same form. The factors of A = L D L' are inverted. Pivots are at least
     `smallest`, and at least 1e-14 of the trace, the limit of rounding. Therefore, the inverse is
@@ -72,7 +71,7 @@ SHADOW_SHARE = 0.05  # observations below this share of a pixel's largest one ar
 def shadow_weights(observations: Floats) -> Floats:
     """Return weights (P, F), 1 for lit observations and nearly 0 for shadows.
 
-    The largest observation of each pixel is 1.
+    The largest observation of each pixel must be 1.
     """
     return np.where(observations < SHADOW_SHARE, 1e-3, 1.0).astype(observations.dtype)
 
@@ -110,7 +109,7 @@ def _sum_over_lights(values: Floats, terms: Floats) -> Floats:
 
 def absolute_weights(residuals: Floats) -> Floats:
     """Return weights for least absolute deviations by iteratively reweighted least squares."""
-    # Residuals far below this number have nearly equal weights.
+    # Residuals far below this value have nearly equal weights.
     return np.asarray(1 / (np.abs(residuals) + 0.02))
 
 
@@ -121,8 +120,9 @@ def fit_robustly(
     fit.
 
     The largest value of each pixel's values (P, F) is 1. The weights `lit` (P, F), for example from
-    shadow_weights, do not depend on the fit; `weights` are for the first fit, by default `lit`. The
-    lights (F, 3) or (P, F, 3) have any length, and the number of weighted fits is at least 1.
+    shadow_weights, do not depend on the fit; `weights` are the weights of the first fit, by default
+    `lit`. The lights (F, 3) or (P, F, 3) have any length, and the number of weighted fits is at
+    least 1.
     """
     weights = lit if weights is None else weights
     for _ in range(fits):
@@ -138,7 +138,7 @@ def lit_values(
     (p, F).
 
     The values are relative to the largest of each pixel. Pixels below dark_share of the brightest
-    hundredth are treated as dark, for example the background without a mask.
+    hundredth are treated as dark, for example a background that is not masked.
     """
     brightest = observations.max(axis=1)
     lit = np.flatnonzero(brightest > dark_share * np.quantile(brightest, 0.99))

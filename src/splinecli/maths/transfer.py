@@ -1,5 +1,6 @@
 """Transfer curves between linear and stored values: sRGB (IEC 61966-2-1), gamma curves, tables, and
-the curves in ICC profiles (ISO 15076-1)."""
+curves from ICC profiles (ISO 15076-1).
+"""
 
 import re
 import struct
@@ -11,17 +12,17 @@ from numpy.typing import NDArray
 from splinecli.errors import UsageError, did_you_mean
 from splinecli.maths import Float32Array, Float64Array, Floats
 
-_LINEAR_BELOW = 0.0031308  # linear value below which the sRGB curve is a straight line
+_LINEAR_BELOW = 0.0031308  # linear value below which the sRGB curve is linear
 
-# Use the curve stated by the images: the colour profile's curve, sRGB for JPEG files and for PNG
-# files that state it, otherwise linear.
+# Use the curve stated by the images, which is the colour profile's curve, sRGB for JPEG files and
+# PNG files that state it, and linear otherwise.
 AUTOMATIC = "auto"
 # An exponent (1 is linear), None for sRGB, or a table of the linear values of evenly spaced stored
 # values from 0 to 1
 TransferCurve = float | tuple[float, ...] | None
 SRGB: TransferCurve = None
 _CODES = np.linspace(0, 1, 256)
-# The curve of most videos (ITU-R BT.709), for 8-bit values
+# The curve of most videos (ITU-R BT.709) for 8-bit values
 BT709: TransferCurve = tuple(
     np.where(_CODES < 0.081, _CODES / 4.5, ((_CODES + 0.099) / 1.099) ** (1 / 0.45)).tolist()
 )
@@ -72,15 +73,17 @@ def decode_transfer(stored: Float32Array, curve: TransferCurve) -> Float32Array:
     return np.where(stored <= 12.92 * _LINEAR_BELOW, stored / 12.92, power).astype(np.float32)
 
 
-# Bytes of a profile. Profiles of cameras and screens have a few kilobytes.
+# Size limit of a profile in bytes. Profiles of cameras and screens have a few kilobytes.
 LARGEST_PROFILE = 1 << 22
-_SAMPLES = 4096  # of a curve that has no name
+_SAMPLES = 4096  # of a curve without a name
 _SAME = 1e-3  # difference of linear values below which two curves are considered equal
 
 
 @lru_cache(maxsize=4)
 def profile_curve(profile: bytes) -> tuple[str, TransferCurve] | None:
-    """Return the name and the curve of a profile; None if it is damaged or has no single curve."""
+    """Return the name and the curve of a profile, or None if it is damaged or has no single
+    curve.
+    """
     try:
         if profile[36:40] != b"acsp" or profile[16:20] not in (b"RGB ", b"GRAY"):
             return None

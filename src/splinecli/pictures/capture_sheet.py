@@ -73,7 +73,7 @@ def capture_sheet(
     whole = " (whole image)" if capture.mask.all() else ""
     tiles.append((f"{mask}{whole}", _shown(inside.astype(np.float64), 1.0)))
     for name, other in others.items():
-        # darker than white, so that a uniform image does not look empty
+        # less than white, so that a uniform image does not look empty
         tiles.append((name, _shown(other, 1.5 * float(np.quantile(other, 0.995)))))
 
     columns, tall = min(_COLUMNS, len(tiles)), max(tile.shape[0] for _, tile in tiles)

@@ -1,4 +1,4 @@
-"""Plots: light directions, observation maps, learning curves, and maps of several methods."""
+"""Plots of light directions, observation maps, learning curves, and maps of several methods."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class MethodStyle(NamedTuple):
 
 
 # The colours of Okabe and Ito ("Color Universal Design", 2008), which colour-blind readers can
-# distinguish. Their yellow is replaced by gray, because it is too light for a line on white. The
+# distinguish. Their yellow is replaced with gray, because it is too light for lines on white. The
 # markers are for prints without colour.
 _COLOURS = [
     "#D55E00",
@@ -88,7 +88,7 @@ def sky_plot(
         if ring_deg < 90:  # the labels of 90 and 75 degrees would overlap
             axes.text(0, -radius, f"{ring_deg}°", color="0.5", fontsize=8, ha="center", va="bottom")
     x, y = light_directions[:, 0], light_directions[:, 1]
-    if errors_deg is not None:  # circles on the sphere around the directions
+    if errors_deg is not None:  # draw circles on the sphere around the directions
         radii = np.radians(errors_deg)[:, None, None]
         smallest = np.abs(light_directions).argmin(axis=1)
         across = unit(np.cross(light_directions, np.eye(3)[smallest]))

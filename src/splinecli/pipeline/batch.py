@@ -1,4 +1,4 @@
-"""Run `infer` on many captures, in this process or in others, and continue if a capture fails.
+"""Run `infer` on many captures, in this or other processes, and continue if a capture fails.
 
 Duplicate folders are ignored. Captures with up-to-date results are skipped. If a capture fails, its
 error is recorded.
@@ -81,7 +81,7 @@ class BatchItem:
 
 
 def list_captures(folders: Sequence[Path], shard: Shard | None = None) -> list[BatchItem]:
-    """Return the captures in the order given, without duplicate folders.
+    """Return the captures in the given order, without duplicate folders.
 
     Raises UsageError if images are given instead of their folder, two captures have the same name,
     or a "folder" that does not exist is the name of a map, format or method.
@@ -301,8 +301,8 @@ def infer_batch(
 ) -> Iterator[Outcome]:
     """Run `infer_capture` on each folder and yield the outcomes.
 
-    They come in order, or from other processes as they finish. With several captures, or if
-    OUT/index.html already exists, that page is written at the end.
+    Outcomes are in order or, with other processes, yielded as captures finish. With several
+    captures, or if OUT/index.html already exists, that page is written at the end.
 
     Args:
         folders: the captures. Duplicates are ignored.

@@ -282,7 +282,7 @@ def _depth_map(
 ) -> Float64Array:
     from scipy.ndimage import label
 
-    parts = label(mask)[0][mask] - 1  # label joins pixels that share a side, as the equations do
+    parts = label(mask)[0][mask] - 1  # label connects pixels that share a side, as the equations do
     offsets = np.bincount(parts, heights) / np.bincount(parts)
     if prior is not None:
         # Parts without a prior have the mean height of the known pixels.
@@ -313,6 +313,6 @@ def _check_maps(normal_map: Floats, mask: Bools) -> None:
     if wrong.any():
         row, column = np.argwhere(wrong)[0]
         problem = f"{np.count_nonzero(wrong)} of {length.size} normals in the mask are not unit"
-        hint = "Leave pixels without a normal out of the mask"
+        hint = "Exclude pixels without a normal from the mask"
         first = f"the first in row {row}, column {column}"
         raise InputError(f"{problem} vectors, {first}", hint=hint)

@@ -49,7 +49,7 @@ def plane_slopes(
     sizes = np.linalg.svd(terms[:, :2], compute_uv=False)
     if sizes[-1] <= 1e-2 * sizes[0]:  # both are 0 for a single point
         given = "points of --level" if points else "pixels of the object"
-        hint = "Choose points that span a plane" if points else "Leave --level out"
+        hint = "Choose points that span a plane" if points else "Omit --level"
         raise UsageError(f"the {given} are on one line", hint=hint)
     weights, plane = np.ones(len(z)), np.zeros(3)
     for _ in range(1 if points else _FITS):

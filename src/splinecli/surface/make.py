@@ -65,7 +65,7 @@ class SurfaceSettings:
             option, hint = "--pixel-aspect", "The aspect follows from fx and fy of the matrix"
         if camera_matrix is not None and (self.level is not None or self.pixel_aspect != 1):
             raise UsageError(
-                f"{option} needs an orthographic camera, but there is a camera matrix", hint=hint
+                f"{option} requires an orthographic camera, but a camera matrix is given", hint=hint
             )
 
 

@@ -130,11 +130,11 @@ def check_triangles(mask: Bools, path: Path) -> None:
     count = mask.astype(np.uint8)
     squares = count[:-1, :-1] + count[1:, :-1] + count[:-1, 1:] + count[1:, 1:]
     if not (squares >= 3).any():
-        raise no_triangles(path, instead="leave --surface out")
+        raise no_triangles(path, instead="omit --surface")
 
 
 def no_triangles(
-    path: Path | None = None, *, instead: str = "leave glb out of the formats"
+    path: Path | None = None, *, instead: str = "omit glb from the formats"
 ) -> InputError:
     """Return the error for a mesh without triangles."""
     return InputError(

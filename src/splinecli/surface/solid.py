@@ -29,7 +29,7 @@ def close_mesh(mesh: SurfaceMesh, thickness: float, *, perspective: bool) -> Sur
     """
     triangles = _manifold(mesh.triangles)
     if not len(triangles):
-        raise no_triangles(instead="leave --solid out")
+        raise no_triangles(instead="omit --solid")
     used, numbers = np.unique(triangles, return_inverse=True)
     triangles = numbers.reshape(-1, 3).astype(np.int32)
     front = mesh.vertices[used]

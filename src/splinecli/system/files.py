@@ -1,4 +1,4 @@
-"""Files: queries about paths, and output files that appear either complete or not at all."""
+"""Query paths, and write output files that appear either complete or not at all."""
 
 import errno
 import hashlib
@@ -19,11 +19,11 @@ from msgspec import ValidationError, convert
 from splinecli.errors import InputError, OutputError
 
 UNFINISHED = ".splinecli-unfinished"  # suffix of hidden files that are being written
-_MOST_JSON = 1 << 24  # largest size of a JSON file in bytes
+_MOST_JSON = 1 << 24  # size limit of JSON files in bytes
 
 
 def free_name(name: str, is_taken: Callable[[str], bool], mark: str = "-") -> str:
-    """Return the name, with a mark and a number from 2 if it is taken."""
+    """Return the name, with a mark and a number from 2 on appended if it is taken."""
     numbered = (f"{name}{mark}{number}" for number in itertools.count(2))
     return next(each for each in itertools.chain([name], numbered) if not is_taken(each))
 
@@ -190,7 +190,7 @@ def read_json(path: Path, kind: type[Value] | Any = Any) -> Value | Any:
     if is_special(path):
         raise ValueError("it is not a file")
     if path.stat().st_size > _MOST_JSON:
-        raise ValueError(f"it has more than {_MOST_JSON / 1e6:.0f} MB")
+        raise ValueError(f"it is larger than {_MOST_JSON / 1e6:.0f} MB")
     return parse_json(path.read_text("utf-8"), kind)
 
 
@@ -239,7 +239,7 @@ def check_writable(folder: Path) -> None:
     if not place.is_dir():
         raise OutputError("found a file, expected a folder for the results", place, hint=hint)
     if not os.access(place, os.W_OK | os.X_OK):
-        raise OutputError("no permission to write into this folder", place, hint=hint)
+        raise OutputError("no permission to write to this folder", place, hint=hint)
 
 
 def check_free(folder: Path, names: Iterable[str], *, overwrite: bool) -> None:
@@ -269,7 +269,7 @@ StrPath = str | os.PathLike[str]  # a path in any form accepted by the standard 
 
 
 def find_mode(path: Path) -> int | None:
-    """Return the mode of a path (see stat), following links; None if it does not exist.
+    """Return the mode of a path (see stat), following links, or None if it does not exist.
 
     Raises InputError.
     """
@@ -330,7 +330,7 @@ def is_substitution(path: Path) -> bool:
 
 
 def is_folder(path: Path) -> bool:
-    """Return whether a folder exists; False if the system does not answer."""
+    """Return whether a folder exists, or False if the system does not answer."""
     return os.path.isdir(path)  # noqa: PTH112 - Path.is_dir raises for a name that is too long
 
 

@@ -275,8 +275,8 @@ def count_available_cores() -> int:
 
 
 def count_chosen_cores() -> int:
-    """Return the number of available cores, or OMP_NUM_THREADS if that is less: workers share the
-    cores in this way.
+    """Return the number of available cores, or OMP_NUM_THREADS if that is less, which divides the
+    cores among workers.
     """
     chosen, cores = os.environ.get("OMP_NUM_THREADS", ""), count_available_cores()
     return max(1, min(cores, int(chosen))) if chosen.isdecimal() else cores

@@ -1,4 +1,4 @@
-"""Sets of output files, in folders to which only one process at a time writes.
+"""Write sets of output files to folders to which only one process at a time writes.
 
 Each new file is written under a random hidden name and synced. When all are complete, the earlier
 report is removed, then the earlier files. The new files are renamed to their places, and the new
@@ -94,7 +94,7 @@ def _locked_file(path: Path, *, wait: bool) -> IO[str]:
             raise BusyError(
                 "another splinecli process is writing to this folder",
                 path.parent,
-                hint="Wait until it is finished, or choose another -o",
+                hint="Wait until it has finished, or choose another -o",
             )
         if not got:
             time.sleep(0.02)

@@ -1,4 +1,4 @@
-"""Weight files: safetensors with a format, metadata and a checksum of the tensors. Nothing is
+"""Weight files in safetensors format, with metadata and a checksum of the tensors. Nothing is
 unpickled.
 """
 
@@ -67,7 +67,7 @@ def read_tensors(
         ) from error
     if metadata.get("tensors_sha256") != tensors_sha256(tensors):
         raise ModelError(
-            "the file is damaged: the tensors do not match its checksum", path, hint=hint
+            "the file is damaged: its tensors do not match its checksum", path, hint=hint
         )
     return tensors, metadata
 

@@ -178,7 +178,7 @@ def test_lamps_without_positions(tmp_path, render_ball, known):
     )
     assert (
         calibration_lines(report)[-1]
-        == "the lamps' distances are unknown, so the lamps are treated as distant"
+        == "the distances of the lamps are unknown, so the lamps are treated as distant"
     )
     expected = (
         "move the balls farther apart" if known else "If the lamps are near, add --camera-matrix."

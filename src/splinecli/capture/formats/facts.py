@@ -93,7 +93,7 @@ class ImageHeader:
     """The facts in the header of an image file."""
 
     path: Path
-    kind: str = ""  # "PNG", "JPEG", "TIFF", "BMP", "TGA", "RAW" or "MAT"; empty for none
+    kind: str = ""  # "PNG", "JPEG", "TIFF", "BMP", "TGA", "RAW" or "MAT"; empty if unknown
     stated_size: StoredSize | None = None  # None for a RAW file, and for a damaged one
     # from cICP or a colour profile; otherwise sRGB for JPEG, and for PNG with sRGB or gAMA
     curve: StatedCurve = StatedCurve()

@@ -99,7 +99,7 @@ def find_view(image: ImageHeader, matrix: Path | None) -> View:
 
 
 def _focal_length(tags: Mapping[int, Any], width: int, height: int) -> float | None:
-    """Return the focal length in pixels from EXIF tags; None if it is missing."""
+    """Return the focal length in pixels from EXIF tags, or None if it is missing."""
     millimetres = {2: 25.4, 3: 10.0}  # in an inch and a centimetre, by EXIF's codes of units
     try:
         if tags.get(_RESOLUTION) and tags.get(_FOCAL_LENGTH) and tags.get(_UNIT, 2) in millimetres:
@@ -108,7 +108,7 @@ def _focal_length(tags: Mapping[int, Any], width: int, height: int) -> float | N
             pixels *= width / float(tags.get(_WIDTH) or width)  # in case the picture was scaled
         else:
             pixels = float(tags[_FILM]) / math.hypot(36, 24) * math.hypot(width, height)
-    except Exception:  # damaged tags cause a dozen types of errors
+    except Exception:  # damaged tags raise a dozen types of errors
         return None
     return pixels if SHORTEST_LENS / 3 * width < pixels < DISTANT else None
 
@@ -329,7 +329,7 @@ def calibrate_ball(
         stored = decode_image(path, ExpectedSize(shape, files.images[0].name))
         if not circle.inside(shape).any():
             raise InputError(
-                "the circle is outside the image", path=path, hint="Give --circle X,Y,R in pixels"
+                "the circle is outside the image", path=path, hint="Pass --circle X,Y,R in pixels"
             )
         full_scale = 1.0 if stored.dtype.kind == "u" else None
         gray = to_linear(stored, path).mean(axis=2)
@@ -368,8 +368,7 @@ _LEAST_MOTION = 0.02  # median distance of highlights from their median, relativ
 
 
 def _doubt(circles: Sequence[Circle], highlights: Float64Array, n_agreeing: int) -> str | None:
-    """Return a reason why the first circle may not be the outline of a mirror ball; None without
-    one.
+    """Return a reason why the first circle may not be the outline of a mirror ball, or None.
 
     The circles were found in a picture, and the highlights are (F, 2).
     """
@@ -436,8 +435,8 @@ def _keep_shape(highlights: Sequence[Highlight], circle: Circle) -> bool:
 
 
 def combine_balls(balls: Sequence[BallCalibration]) -> CalibratedLights:
-    """Return the mean light directions over the balls. Raises InputError for unequal numbers of
-    images.
+    """Return the mean light directions over the balls. Raises InputError if the numbers of images
+    differ.
     """
     if len({len(ball.directions) for ball in balls}) > 1:
         counts = ", ".join(f"{len(ball.directions)} images ({ball.files.folder})" for ball in balls)

@@ -1,4 +1,4 @@
-"""The outline of a ball: a circle from a mask or an image, with measures of its quality.
+"""Find the outline of a ball as a circle in a mask or an image, with measures of its quality.
 
 Coordinates are in pixels of the image: x right, y down, with integers at pixel centres and (0, 0)
 at the top left pixel.
@@ -128,7 +128,7 @@ def find_circles(image: Array) -> list[Circle]:
             " circle with --circle X,Y,R"
         )
         raise InputError("found no circle, expected a ball", hint=hint)
-    # Reflections in the ball may also be circles. Of two equally visible circles, the larger one is
+    # Reflections in the ball may also be circles, so the larger of two equally visible circles is
     # the ball.
     return sorted(circles, key=lambda each: -each.visible * math.sqrt(each.radius))
 
@@ -152,7 +152,7 @@ def _brightened(image: Array) -> Float32Array:
 def _refine(values: Float32Array, guess: Circle) -> Circle | None:
     """Return the circle through the strongest edges along rays from the centre of a guess.
 
-    None if too few edges agree.
+    Return None if too few edges agree.
     """
     for band in (_SEARCH_BAND, _SEARCH_BAND / 2):
         half = max(band * guess.radius, 3.0)

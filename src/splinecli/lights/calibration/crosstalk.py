@@ -1,5 +1,5 @@
-"""Crosstalk of three coloured lamps that light a matte gray ball at once: the share of each lamp in
-each channel.
+"""Measure the crosstalk of three coloured lamps that light a matte gray ball at once, the share of
+each lamp in each channel.
 """
 
 from __future__ import annotations

@@ -165,12 +165,12 @@ class LampPositions:
 def triangulate_lamps(
     balls: Sequence[BallCalibration], *, ball_diameter: float | None = None
 ) -> LampPositions | None:
-    """Return the positions of the lamps from balls photographed by one camera; None for a single
+    """Return the lamp positions from balls photographed by one camera, or None if all are in one
     place.
 
     The uncertainty is found by repeating the computation with random errors of the pixels, the
-    heights of the balls and the camera (View.draw). It is increased if the rays miss each other by
-    more than these errors explain.
+    heights of the balls and the camera (View.draw). It is increased if the distances between the
+    rays are larger than these errors explain.
 
     Args:
         balls: at least two balls, or one ball at two places.
@@ -187,8 +187,8 @@ def triangulate_lamps(
     drawn = [_positions(balls, view.draw(generator), ball_diameter, generator) for _ in range(200)]
     errors = np.array([np.linalg.norm(other - positions, axis=1) for other, _, _ in drawn])
     errors[np.isnan(errors)] = np.inf
-    # If _PIXEL_ERROR is correct, a draw increases the misses by as much as the errors in the images
-    # did.
+    # If _PIXEL_ERROR is correct, a draw increases the distances between the rays by as much as the
+    # errors in the images did.
     added = float(np.nanmedian([other for _, _, other in drawn])) - miss
     excess = math.sqrt(max(1.0, miss / added if added > 0 else 1.0))
     uncertainty = excess * np.quantile(errors, 0.95, axis=0, method="higher")
@@ -343,7 +343,7 @@ def calibration_lines(report: dict[str, Any]) -> list[str]:
         )
     lamps = report["lamp_positions"]
     if lamps and not lamps["known"]:
-        lines.append("the lamps' distances are unknown, so the lamps are treated as distant")
+        lines.append("the distances of the lamps are unknown, so the lamps are treated as distant")
     elif lamps:
         distances = np.linalg.norm(lamps["positions"], axis=1)
         shares = 100 * np.array(lamps["uncertainty"]) / distances
