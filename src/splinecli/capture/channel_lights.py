@@ -123,7 +123,7 @@ _REFERENCE = re.compile(
     r"(?<![a-z])(ref|reference|background|bg|empty|blank|flat|baseline|no[_-]?contact|untouched)"
     r"(?![a-z])"
 )
-_FLATTEST = 0.7  # largest mean gradient, relative to that of the next flattest picture
+_FLATTEST = 0.7  # largest mean gradient, relative to the next flattest picture
 _UNCHANGED = 0.03  # natural logarithm of the largest ratio at which pixels are considered equal
 _LEAST_UNCHANGED = 0.3  # smallest share of pixels that must be equal in every other photograph
 

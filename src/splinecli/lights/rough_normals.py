@@ -1,4 +1,5 @@
-"""Rough normals under given lights, and what they and cast shadows reveal about the lights.
+"""Rough normals under given lights, and the evidence about the lights from these normals and from
+cast shadows.
 
 Lights in a wrong frame fit the images as well as correct ones. But the normals of a surface have no
 curl (Horn, "Shape from shading", 1970; Belhumeur, Kriegman and Yuille, "The bas-relief ambiguity",

@@ -55,8 +55,7 @@ _MOST_CELLS = 40_000
 
 @dataclass(frozen=True, eq=False)
 class MaterialMaps:
-    """The material of the P pixels of a mask, with glTF's parameters and further values for
-    pictures.
+    """The material of the P pixels of a mask: glTF's parameters, and further values for rendering.
 
     Args:
         base_colour: (P, 3) linear RGB; all channels are equal for gray images. Since the exposure

@@ -105,7 +105,8 @@ class BilateralEquations:
 
 
 class LaplacianSolver:
-    """Solves the normal equations of pairs of neighbours repeatedly, with changing weights.
+    """A solver for the normal equations of pairs of neighbours that is used repeatedly with new
+    weights.
 
     The matrix is a weighted Laplacian of the graph of pixels.
     """

@@ -52,8 +52,8 @@ def integrate_normals(
 
     For an orthographic camera, the result is the height towards the camera in pixels. With a camera
     matrix, it is the positive depth along the viewing axis, of unknown scale. Normals do not
-    determine the offset between parts that are not connected by a side of a pixel, so each part has
-    mean height 0 or geometric mean depth 1.
+    determine the offset between parts of the mask whose pixels share no side, so each part has mean
+    height 0 or geometric mean depth 1.
 
     Args:
         normal_map: unit normals in the mask, row 0 at the top; x right, y up, z to the camera.
@@ -67,8 +67,8 @@ def integrate_normals(
             like the result, NaN where they are unknown. The result has its large-scale shape, its
             offset and, for depths, its scale.
         prior_detail: the wavelength in pixels at which prior and normals have equal weight. At
-            longer wavelengths, the prior dominates. None for 15 % of the square root of the mask's
-            area.
+            longer wavelengths, the prior dominates. None means 15 % of the square root of the
+            mask's area.
         progress: is called with shares of the work, which may add up to less than 1.
 
     Raises:
@@ -149,9 +149,9 @@ def _integrate(
 ) -> Float64Array:
     """Return the heights (P,) of the mask's pixels, with the method of integrate_normals.
 
-    They are finished when they move by less than `still`, the rms in pixels. A large map starts
-    from the heights of blocks of 2 x 2 pixels, so that the tears of the surface and their sizes are
-    found at the coarsest scale, where many solves take little time. Finer scales follow the edges.
+    Iteration stops when their rms movement is below `still` pixels. A large map starts from the
+    heights of blocks of 2 x 2 pixels, so that the tears of the surface and their sizes are found at
+    the coarsest scale, where many solves take little time. Finer scales follow the edges.
     """
     normal_map, mask, camera_matrix, prior, prior_detail = surface
     equations = BilateralEquations.from_normals(normal_map, mask, camera_matrix)

@@ -215,8 +215,8 @@ def decimated_mesh(
     """Return a mesh of about `n_triangles` triangles, with a texture of the normals.
 
     The outline is smoothed, and edges are collapsed where this changes the surface least (Garland
-    and Heckbert, Surface simplification using quadric error metrics, SIGGRAPH 1997). A mesh that
-    does not have more triangles is returned as it is.
+    and Heckbert, Surface simplification using quadric error metrics, SIGGRAPH 1997). A mesh without
+    more triangles than that is returned unchanged.
 
     Args:
         depth, mask, camera_matrix, largest_step: see surface_mesh.

@@ -94,8 +94,8 @@ def own_groups(controller: str) -> Iterator[Path]:
         if not top.is_dir():
             top = MOUNT / controller
         folder = top / group.lstrip("/")
-        # In a container, the path may be that of the host, which does not exist here. The top
-        # always exists.
+        # In a container, this may be a path on the host, which does not exist here. The top always
+        # exists.
         for place in (folder, *folder.parents):
             yield place
             if place == top:

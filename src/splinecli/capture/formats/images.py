@@ -33,7 +33,7 @@ class ExpectedSize:
     """The size that an image is expected to have."""
 
     shape: tuple[int, ...]  # (H, W) or (H, W, C)
-    like: str  # what else has this size, for messages, such as the name of the first image
+    like: str  # the source of this size, for messages, such as the name of the first image
     what: str = "an image"  # description of the image, with an article
 
     def check(self, found: tuple[int, ...], path: Path) -> None:

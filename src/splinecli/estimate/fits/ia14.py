@@ -18,8 +18,9 @@ _RIDGE = 1e-10  # makes the normal and the polynomial of a black pixel unique
 def solve_ia14(
     observations: Tensor, light_directions: Tensor, valid: Tensor | None = None
 ) -> Tensor:
-    """Return normals (P, 3) from observations (P, F) up to 1 under lights (F, 3) or (P, F, 3); see
-    fit_ia14.
+    """Return normals (P, 3) from observations (P, F) of at most 1 under lights (F, 3) or (P, F, 3).
+
+    See fit_ia14.
     """
     return fit_ia14(observations, light_directions, valid)[0]
 

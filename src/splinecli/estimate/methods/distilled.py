@@ -3,9 +3,9 @@ the pixels.
 
 A capture has one set of lights, or lights that change smoothly over the image, and few materials,
 so most of its pixels are redundant. The network estimates a sample of the pixels. Trained on this
-sample, the perceptron estimates the rest over 100 times as fast. What it does not reproduce is
-mostly the network's noise (Hinton, Vinyals and Dean, Distilling the knowledge in a neural network,
-arXiv 1503.02531).
+sample, the perceptron estimates the rest over 100 times as fast. The part that it does not
+reproduce is mostly the network's noise (Hinton, Vinyals and Dean, Distilling the knowledge in a
+neural network, arXiv 1503.02531).
 """
 
 import itertools

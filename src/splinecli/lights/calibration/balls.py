@@ -253,7 +253,9 @@ class BallCalibration:
 
 
 class NoHighlightError(InputError):
-    """An image of a ball has no usable highlight. `ball` has those of the images before it."""
+    """An image of a ball has no usable highlight. `ball` contains the highlights of earlier
+    images.
+    """
 
     def __init__(self, error: InputError, path: Path, ball: BallCalibration) -> None:
         super().__init__(error.problem, path=path, hint=error.hint)
