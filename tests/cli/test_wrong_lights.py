@@ -129,7 +129,7 @@ def test_mended_lights(run, medallion):
     for suffix in ("json", "mat", "yml", "xml"):
         run(
             f"info {medallion} --mended-lights mended.{suffix}",
-            usage_error=f"of the type .{suffix} can be read but not written. Write .txt",
+            usage_error=f".{suffix} light files can be read but not written. Write .txt",
         )
         assert not Path(f"mended.{suffix}").exists()
 
