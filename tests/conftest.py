@@ -13,11 +13,11 @@ import pytest
 from numpy.random import default_rng
 
 from browser import browser, open_page
-from scenes import cap_directions, directions_at, put, shade, spiral_lights
+from scenes import cap_directions, put, shade, spiral_lights
 from small_pixel_sets import make_set
 from splinecli.system.progress import STAGES
 
-__all__ = ["browser", "directions_at", "make_set", "open_page"]
+__all__ = ["browser", "make_set", "open_page"]
 GOLDEN = Path(__file__).resolve().parent / "golden"
 
 

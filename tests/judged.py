@@ -6,9 +6,9 @@ from splinecli.capture.arrays import ArraySource
 from splinecli.judge.checks import check_capture
 
 
-def warnings_of(capture, *, intensities=None):
-    """Return the warnings about a capture, whose light intensities (F,) or (F, 3) were given or are
-    unknown.
+def judgement_of(capture, *, intensities=None):
+    """Return what the checks find in a capture, whose light intensities (F,) or (F, 3) were given
+    or are unknown.
     """
     known = intensities is not None
     given = (
@@ -25,4 +25,9 @@ def warnings_of(capture, *, intensities=None):
         intensities_known=known,
         intensities_measured=known,
     )
-    return check_capture(source, capture).warnings
+    return check_capture(source, capture)
+
+
+def warnings_of(capture, *, intensities=None):
+    """Return the warnings of judgement_of."""
+    return judgement_of(capture, intensities=intensities).warnings

@@ -82,6 +82,13 @@ def tilted(x, y):
     return unit(np.stack((x, y, np.ones_like(x)), axis=-1))
 
 
+def bumps(size):
+    """Normals (size, size, 3) of a relief that fills the picture."""
+    y, x = np.mgrid[:size, :size] / size * 9
+    down, right = np.gradient(5 * np.sin(x) * np.cos(0.7 * y) + 3 * np.sin(1.3 * x + 2 * y))
+    return tilted(-right, down)
+
+
 def sphere(size, reach=0.97):
     """Normals (size, size, 3) of a unit sphere that touches the frame, and the mask of radius
     `reach`.

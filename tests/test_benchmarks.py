@@ -1,31 +1,24 @@
-"""Each benchmark runs to its end on small inputs and prints every row."""
+"""Benchmarks run to their end on small inputs and print every row."""
 
 import importlib
-import math
 import re
 import shutil
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from pytest import approx
 from safetensors.numpy import load_file
-from scipy.spatial.transform import Rotation
 
 from scenes import parametrize, read_json
 from splinecli import __version__
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.judge.judge_net import CLASSES, JudgeNet
-from splinecli.maths.normals import unit
 from splinecli.workshop.save_weights import save_weights
 
 ROOT = Path(__file__).resolve().parents[1]
 MEDALLION = str(ROOT / "examples/medallion")
-Run = Callable[..., str]
 
 
 @pytest.fixture
@@ -81,19 +74,6 @@ def test_faulty_captures(run, tmp_path, monkeypatch):
     assert all(len(numbers(row)) == 8 for row in rows[2:])
 
 
-def test_faulty_captures_of_pixel_sets(run, make_set, tmp_path):
-    folder = str(make_set(entries=[("a", "one", 400, 30)]).folder)
-    run(f"faulty_captures {tmp_path}/made --scenes 4 --part 2/2 --sets {folder}")
-    made = [dict(np.load(path)) for path in (tmp_path / "made").glob("*.npz")]
-    assert len(made) >= 4
-    assert len({int(each["scene"]) for each in made}) == 1
-    assert all(
-        each["mask"].sum() == 400 == each["known"].sum()
-        for each in made
-        if each["kind"] != "no mask"
-    )
-
-
 @pytest.mark.usefixtures("coarse_shapes")
 def test_render_accuracy(run):
     pytest.importorskip("mitsuba", reason="compares with Mitsuba 3")
@@ -141,27 +121,6 @@ def test_large_captures(run, tmp_path):
     assert plot.stat().st_size > 1000
 
 
-def test_gpu_session(tmp_path):
-    """A step that fails, or has no time left, is reported, and the others go on."""
-    module = importlib.import_module("gpu_session")
-    session = module.Session(tmp_path, tmp_path, time.time() + 60)
-    normals = np.broadcast_to((0.0, 0.6, 0.8), (2, 2, 3))
-    np.save(tmp_path / "one.npy", normals)
-    np.save(tmp_path / "other.npy", normals[..., [0, 2, 1]])
-    one, other = str(tmp_path / "one.npy"), str(tmp_path / "other.npy")
-    found = session.step("apart", module.normals_apart, one, other, seconds=60)
-    turned = math.degrees(math.asin(0.8) - math.asin(0.6))
-    assert (found["mean_deg"], found["max_deg"]) == approx((turned, turned))
-    assert session.step("missing", module.normals_apart, one, f"{other}.gz", seconds=60) is None
-    session.ends = time.time()
-    assert session.step("late", module.normals_apart, one, other, seconds=60) is None
-    report = (tmp_path / "report.txt").read_text()
-    assert report.count("FAILED") >= 2 and "FileNotFoundError" in report
-    assert "there is no time left" in report
-    steps = [entry["step"] for entry in read_json(tmp_path / "report.json")]
-    assert steps == ["apart", "missing", "late"]
-
-
 def test_all_figures(run, tmp_path):
     """A row is stored with what it was measured with, and is not measured again."""
     for name in ("ballPNG", "catPNG", "readingPNG"):
@@ -203,48 +162,6 @@ def test_measured_spheres(run, shared_data, tmp_path):
     printed = run(f"measured_spheres {materials} {lights} {arguments}").splitlines()
     trained, fit = (float(re.findall(r": (\S+) degrees", line)[0]) for line in printed)
     assert trained < 0.7 * fit
-
-
-def test_measured_materials_are_those_of_explicit_vectors(tmp_path, rng):
-    arrays = {}
-    for layer, shape in enumerate(((6, 5), (5, 4), (4, 3)), start=1):
-        arrays[f"W{layer}"] = rng.normal(0.2, 0.3, (3, *shape))
-        arrays[f"b{layer}"] = rng.normal(0.2, 0.3, (3, shape[1]))
-    np.savez(tmp_path / "materials.npz", names=["first", "brass", "third"], **arrays)
-    materials = importlib.import_module("measured_spheres").read_materials(
-        tmp_path / "materials.npz"
-    )
-    assert materials.names == ["first", "third"]  # not the implausible one
-    normals, lights = (rng.normal((0, 0, 2), 1, (count, 3)) for count in (6, 20))
-    normals, lights = (unit(v) for v in (normals, lights))
-    n, light = (torch.from_numpy(v).float() for v in (normals, lights))
-    shaded = materials.shade(torch.tensor([0, 1] * 3), n @ light.T, n[:, 2:], light[:, 2])
-    for pixel, column in np.ndindex(6, 20):
-        expected = _brdf(arrays, 2 * (pixel % 2), normals[pixel], lights[column])
-        expected *= math.pi * max(float(normals[pixel] @ lights[column]), 0)
-        # In float32, the angles are known to some 1e-4 where half vector and normal all but meet.
-        assert shaded[pixel, column].item() == approx(expected, rel=1e-3, abs=1e-5)
-
-
-def _brdf(arrays, material, n, light):
-    """The gray BRDF by Rusinkiewicz's definition, with rotations of explicit vectors,
-    in float64.
-    """
-    view = np.array((0.0, 0.0, 1.0))
-    if light @ n < view @ n:
-        light, view = view, light
-    half = (light + view) / np.linalg.norm(light + view)
-    tangent = half - (half @ n) * n
-    tangent /= np.linalg.norm(tangent)
-    # the normal along z, the half vector at azimuth zero
-    frame = np.stack((tangent, np.cross(n, tangent), n))
-    half, light = frame @ half, frame @ light
-    difference = Rotation.from_euler("y", -math.acos(half[2])).apply(light)
-    value = np.concatenate((half, (difference[0], abs(difference[1]), difference[2])))
-    for layer in (1, 2):
-        value = np.maximum(value @ arrays[f"W{layer}"][material] + arrays[f"b{layer}"][material], 0)
-    value = np.exp(value @ arrays["W3"][material] + arrays["b3"][material]) - 1
-    return np.maximum(value, 0).mean()
 
 
 @pytest.mark.usefixtures("coarse_shapes")

@@ -89,7 +89,6 @@ def alice(names, **more):
 
 NUMBERS = [name.removesuffix(".png") for name, _ in NAMED]
 FOUND = {
-    "University of Washington": ("lights.txt", f"12\n{LINES}"),
     "lp": ("dome.lp", f"12\n{LP}"),
     "foreign paths": ("a.LP", "12\n" + re.sub("(?m)^", r"C:\\\\RTI\\\\a vase\\\\", LP)),
     "by name without suffix": ("a.lp", LP.replace(".png", ".JPG")),
@@ -99,10 +98,8 @@ FOUND = {
         "lights.json",
         alice(["47", *NUMBERS[1:]], intensity=[1, 1.0, 1]),
     ),
-    "csv": ("lights.csv", "x,y,z\n" + LINES.replace(" ", ",")),
     "csv with names": ("lights.csv", "image,x,y,z\n" + LP.replace(" ", ",")),
     "list": ("lights.txt", str(ROWS)),
-    "list of lines": ("lights.txt", str(ROWS).replace("],", "],\n")),
     "printed by NumPy": ("lights.txt", str(LIGHTS)),
     "tuples": ("light_directions.txt", "\n".join(str(tuple(row)) for row in ROWS)),
     "lp without a count": ("dome.lp", LP),

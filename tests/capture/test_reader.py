@@ -1,8 +1,7 @@
-"""Whole captures: observations against the photographs written, and real ones against known errors;
-what the record refuses; reading ahead.
+"""Whole captures: observations against the photographs written, what the record refuses, and files
+that are decoded at once.
 """
 
-import threading
 from contextlib import suppress
 
 import cv2
@@ -22,11 +21,8 @@ from scenes import (
     write_capture,
 )
 from splinecli.capture import Capture, open_capture
-from splinecli.capture import source as module
 from splinecli.capture.formats.images import decode_image
-from splinecli.capture.source import read_ahead
 from splinecli.errors import InputError, UsageError
-from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.recipe import prepare_capture, read_capture
 from splinecli.system.machine import in_order
 
@@ -148,26 +144,6 @@ def test_warnings(capture_folder, write_image):
         )
 
 
-@parametrize(
-    "name, n_pixels, mae_deg",
-    [("ballPNG", 15791, 4.29), ("catPNG", 45200, 8.45)],
-    # the errors: the README beside the data; 0.02 for their rounding and the light files' four
-    # decimals
-)
-def test_least_squares_on_diligent(shared_data, name, n_pixels, mae_deg):
-    capture = read_capture(shared_data / "DiLiGenT/pmsData" / name, as_stored=True)
-    assert capture.name == name
-    assert capture.observations.shape == (n_pixels, 96)
-    solution = np.linalg.lstsq(
-        capture.light_directions, np.float64(capture.observations.T), rcond=None
-    )[0]
-    truth = capture.ground_truth[capture.mask]
-    scored = truth.any(axis=1)
-    assert angle_between_deg(unit(solution.T), truth)[scored].mean() == pytest.approx(
-        mae_deg, abs=0.02
-    )
-
-
 @parametrize("scale, spread, warned", [(1, 0.3, False), (600, 0, False), (200, 0.3, True)])
 def test_positions_given_as_directions_are_named(tmp_path, scale, spread, warned):
     """Vectors of one length, or of about 1, are directions."""
@@ -214,9 +190,7 @@ NO_NORMAL = "a ground-truth normal is neither a unit vector nor zero"
             {"light_directions": FOUR_LIGHTS[:, :2]},
             r"light directions of shape \(4, 2\), expected \(4, 3\)",
         ),
-        ({"light_indices": (0, 1, 2)}, r"light directions of shape \(4, 3\), expected \(3, 3\)"),
         ({"light_directions": FOUR_LIGHTS * 1.01}, "a light direction is not a unit vector"),
-        ({"light_directions": FOUR_LIGHTS * np.nan}, "a light direction is not a unit vector"),
         (
             {"light_directions": FOUR_LIGHTS * [1, 1, -1]},
             r"light 0 is below the horizon \(z <= 0\)",
@@ -228,7 +202,6 @@ NO_NORMAL = "a ground-truth normal is neither a unit vector nor zero"
             r"ground truth of shape \(3, 2, 3\), expected .* \(2, 3, 3\)",
         ),
         ({"ground_truth": np.full((2, 3, 3), 0.1)}, NO_NORMAL),
-        ({"ground_truth": np.full((2, 3, 3), np.nan)}, NO_NORMAL),
     ],
 )
 def test_fields_that_do_not_fit(changes, message):
@@ -247,29 +220,6 @@ def test_restored_observations_follow_the_choice():
     assert make().choose_lights([0, 1, 2]).restored is None
     with refuses(r"vase: restored flags of shape \(4, 3\), expected .* = \(4, 4\)"):
         make(restored=restored[:, :3])
-
-
-@pytest.fixture(params=[True, False])
-def stderr_is_apart(request, monkeypatch):
-    apart = request.param
-    monkeypatch.setattr(module, "stderr_is_apart", lambda: apart)
-    return apart
-
-
-@parametrize("count", [0, 1, 2, 5])
-def test_all_come_in_their_order(stderr_is_apart, count):
-    assert list(read_ahead(lambda item: 10 * item, range(count))) == [
-        10 * item for item in range(count)
-    ]
-
-
-def test_the_next_item_is_read_meanwhile(monkeypatch):
-    monkeypatch.setattr(module, "stderr_is_apart", lambda: True)
-    begun = [threading.Event() for _ in range(4)]
-    for item in (images := read_ahead(lambda item: begun[item].set() or item, range(4))):
-        assert begun[min(item + 1, 3)].wait(10)
-        assert not any(event.is_set() for event in begun[item + 2 :])
-    assert next(images, None) is None
 
 
 def test_only_the_damaged_one_of_files_that_are_decoded_at_once_is_refused(tmp_path):

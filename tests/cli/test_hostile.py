@@ -18,7 +18,7 @@ import pytest
 
 from scenes import parametrize, put, run_python, shell
 from splinecli.cli import main
-from splinecli.cli.signals import GRACE_SECONDS, TOLD, report_interruption
+from splinecli.cli.signals import TOLD, report_interruption
 
 posix = pytest.mark.skipif(os.name == "nt", reason="POSIX files, signals and limits")
 
@@ -229,7 +229,6 @@ def test_a_signal_always_ends_a_process(number, code):
     assert process.returncode == 130
     assert err == "splinecli: interrupted.\n"
     assert time.monotonic() - began < 40  # the machine may be busy
-    assert GRACE_SECONDS[number] < (2 if number == signal.SIGTERM else 6)
 
 
 @posix

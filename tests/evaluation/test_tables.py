@@ -20,12 +20,10 @@ from splinecli.evaluation.document import html_report, results_csv, results_docu
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 from splinecli.evaluation.tables import (
     AVERAGE,
-    best_cells,
     compare,
     holm,
     latex,
     markdown,
-    table_rows,
     trial_averages,
 )
 from splinecli.records.documents import SkippedCapture
@@ -64,16 +62,6 @@ def test_whole_documents(golden):
         ("json", json.dumps(results_document(both), indent=1) + "\n"),
     ):
         golden(f"evaluation_results.{suffix}", text)
-
-
-def test_rows_for_a_terminal():
-    rows = table_rows(TEN)
-    assert rows == [
-        ["method", "ball", "cat", "average"],
-        ["ls", "4.50", "9.00", "6.75"],
-        ["spline-net", "3.25", "9.00", "6.13"],
-    ]
-    assert best_cells(rows) == {(2, 1), (1, 2), (2, 2), (2, 3)}
 
 
 @parametrize(

@@ -11,7 +11,6 @@ from numpy.random import default_rng
 
 from scenes import parametrize, refuses, ring_lights, shade, tilted, vectors, write_capture
 from splinecli.errors import UsageError
-from splinecli.images import alignment
 from splinecli.images.alignment import (
     align_images,
     common_pixels,
@@ -19,8 +18,6 @@ from splinecli.images.alignment import (
     reduced,
     resample,
 )
-from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.maths.robust import fit_scaled_normals
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 
@@ -132,29 +129,6 @@ def test_rotation_zoom_and_perspective_are_found(kind):
     assert residuals(found.transforms, true).max() < 0.15
 
 
-def test_images_that_did_not_move_are_left_as_they_are():
-    found = align_images(photographs(motions(0, "translation"), textured=True), MASK, LIGHTS)
-    assert (found.transforms == np.eye(3)).all()
-
-
-def test_aligned_images_give_the_normals_of_unmoved_ones():
-    true = motions(5.0, "similarity")
-    still, moved = (photographs(each, textured=True) for each in (motions(0, "translation"), true))
-    found = align_images(moved, MASK, LIGHTS).transforms
-    back = np.stack(
-        [
-            resample(i[..., None], i[..., None], t)[1][..., 0]
-            for i, t in zip(moved, found, strict=True)
-        ]
-    )
-    inner = MASK & common_pixels(found, MASK.shape)
-    one, other = (
-        fit_scaled_normals(images[:, inner].T, np.ones((inner.sum(), len(LIGHTS))), LIGHTS)
-        for images in (still, back)
-    )
-    assert angle_between_deg(unit(one), unit(other)).mean() < 0.3
-
-
 @parametrize(
     "spoil",
     [
@@ -254,8 +228,3 @@ def test_captures_that_cannot_be_aligned_are_refused(write_moved, tmp_path):
     for crop, size in (("60,60,30,1", "30 x 1"), ("60,60,1,30", "1 x 30"), ("60,60,1,1", "1 x 1")):
         with refuses(f"found an object of {size} pixels, expected .* 8 x 8"):
             infer(write_moved(), tmp_path, crop=crop)
-
-
-def test_large_captures_are_reduced(monkeypatch):
-    monkeypatch.setattr(alignment, "MOST_VALUES", 100_000)
-    assert alignment.stride_for(1_000_000) == 4

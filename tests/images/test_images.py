@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.random import default_rng
-from numpy.testing import assert_allclose, assert_array_equal
-from numpy.typing import NDArray
+from numpy.testing import assert_array_equal
 
 from scenes import (
     codes,
@@ -35,7 +34,6 @@ from splinecli.records.white_level import WhiteLevel
 
 SIDE = 60
 LIGHTS = spiral_lights(12, 50)
-Images = NDArray[np.integer]
 FULL_SCALE = WhiteLevel(65_535, "full scale")
 
 
@@ -117,28 +115,28 @@ def normalised_to_12_bits():
     return to_uint16(images / images.max(axis=(1, 2), keepdims=True) * 4095)
 
 
-@parametrize(
-    "images",
-    [
-        pytest.param(bright(4000), id="12 bits, not clipped"),
-        pytest.param(bright(37), id="dark"),
-        pytest.param(to_uint16(sphere(noise=0)[0] * 500), id="dark, without noise"),
-        pytest.param(normalised_to_12_bits(), id="each normalised"),
-        pytest.param(with_background(0), id="black background"),
-        pytest.param(with_background(25_000), id="flat bright background"),
-        pytest.param(with_background(4095, 3000), id="flat background at 4095"),
-        pytest.param(with_background(40, 30), id="dark object before a brighter background"),
-        pytest.param(posterised(6, 8000), id="six values"),
-        pytest.param(posterised(40, 1000), id="forty values"),
-        pytest.param(posterised(200, 257), id="8 bits in 16"),
-        pytest.param(ring_over_a_plane(), id="flat patch under a ring of lights"),
-        pytest.param(patches_of_a_cube(), id="constant patches"),
-        pytest.param(np.zeros((12, SIDE, SIDE), np.uint16), id="black"),
-        pytest.param(np.full((12, SIDE, SIDE), 4095, np.uint16), id="constant"),
-    ],
-)
-def test_what_is_not_clipped_is_not_saturated(images):
-    assert find(images) == (FULL_SCALE, 0)
+NOT_CLIPPED = {
+    "12 bits, not clipped": bright(4000),
+    "dark": bright(37),
+    "dark, without noise": to_uint16(sphere(noise=0)[0] * 500),
+    "each normalised": normalised_to_12_bits(),
+    "black background": with_background(0),
+    "flat bright background": with_background(25_000),
+    "flat background at 4095": with_background(4095, 3000),
+    "dark object before a brighter background": with_background(40, 30),
+    "six values": posterised(6, 8000),
+    "forty values": posterised(40, 1000),
+    "8 bits in 16": posterised(200, 257),
+    "flat patch under a ring of lights": ring_over_a_plane(),
+    "constant patches": patches_of_a_cube(),
+    "black": np.zeros((12, SIDE, SIDE), np.uint16),
+    "constant": np.full((12, SIDE, SIDE), 4095, np.uint16),
+}
+
+
+@parametrize("name", NOT_CLIPPED)
+def test_what_is_not_clipped_is_not_saturated(name):
+    assert find(NOT_CLIPPED[name]) == (FULL_SCALE, 0)
 
 
 def test_one_clipped_image_is_not_enough():
@@ -282,17 +280,6 @@ def clipped_at(level):
     restored = stored.copy()
     restore_saturated(restored, truth >= level, GRID_LIGHTS)
     return truth, truth >= level, stored, restored
-
-
-def test_matte_pixels_come_back():
-    truth, saturated, stored, restored = clipped_at(0.6)
-    assert_array_equal(restored[~saturated], stored[~saturated])
-    assert (restored >= stored).all()
-    known = saturated.any(axis=1) & ((~saturated).sum(axis=1) >= 4)
-    assert known.sum() > 50
-    # Stored, they are off by up to 0.4; a pixel's four others tell three unknowns.
-    assert_allclose(restored[known], truth[known], atol=0.015)
-    assert np.abs(stored - truth)[known].max() > 0.2
 
 
 def test_fewer_than_three_others_still_bound_them():

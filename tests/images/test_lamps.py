@@ -11,7 +11,6 @@ from pytest import approx
 
 from scenes import (
     codes,
-    on_sphere,
     parametrize,
     shade,
     sphere,
@@ -117,11 +116,7 @@ INTENSITIES = np.array([0.5, 1.0, 1.6, 0.8, 1.2, 0.7, 1.4, 0.9])
 
 
 def lights(count):
-    azimuth = np.arange(count) * 2.4
-    radius = 0.3 + 0.5 * np.arange(count) / count
-    return np.stack(
-        (radius * np.cos(azimuth), radius * np.sin(azimuth), np.sqrt(1 - radius**2)), axis=-1
-    )
+    return spiral_lights(count, 50, 18)
 
 
 def textured_sphere(directions, *, shine=0.0):
@@ -129,15 +124,11 @@ def textured_sphere(directions, *, shine=0.0):
     if any.
     """
     rng = default_rng(5)
-    axis = np.linspace(-0.95, 0.95, 50)
-    x, y = (values.ravel() for values in np.meshgrid(axis, axis))
-    inside = x**2 + y**2 < 0.9
-    x, y = x[inside], y[inside]
-    normals = on_sphere(x, y)
-    shading = np.maximum(normals @ directions.T, 0) * rng.uniform(0.2, 1, (len(normals), 1))
-    half = unit(directions + np.array((0.0, 0.0, 1.0)))
-    shading += shine * np.maximum(normals @ half.T, 0) ** 40
-    return shading * rng.normal(1, 0.01, shading.shape).clip(0.9, 1.1)
+    normals, inside = sphere(50, 0.95)
+    matte = shade(normals[inside], directions)
+    highlights = shade(normals[inside], directions, gloss=shine, exponent=40) - matte
+    seen = matte * rng.uniform(0.2, 1, (len(matte), 1)) + highlights
+    return seen * rng.normal(1, 0.01, seen.shape).clip(0.9, 1.1)
 
 
 @parametrize("n_lights, shine", [(6, 0.0), (8, 0.0), (8, 0.5)])

@@ -9,9 +9,9 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx
 
-from scenes import parametrize, shade, sphere_cap, spiral_lights
+from scenes import ball, parametrize, shade, sphere_cap, spiral_lights
 from splinecli.capture.arrays import open_arrays
-from splinecli.images.lens_blur import NOISE, REACH, inverse_filter, remove_blur, surroundings
+from splinecli.images.lens_blur import remove_blur, surroundings
 from splinecli.recipe import RecipeOptions, prepare_capture
 
 SIDE, FINER = 96, 4
@@ -81,21 +81,6 @@ def test_images_without_edges_stay_as_they_are(gloss):
     assert removed(np.full((8, SIDE, SIDE), 0.5, np.float32))[1] is None
 
 
-def test_the_filter_inverts_what_noise_leaves_of_the_signal():
-    """Wiener's transfer function, where power and noise are those of the docstring, and the filter
-    is long enough.
-    """
-    sigma = 0.7
-    frequency = np.array([1 / 8, 1 / 4])[:, None]
-    squared = np.add.outer(np.square(np.arange(33) / 64), np.square(np.arange(33) / 64))
-    mean_power = (1 / squared.clip(min=1 / 64**2)).mean()
-    g = np.exp(-2 * (np.pi * sigma * frequency) ** 2)
-    expected = g / (g**2 + NOISE * mean_power * frequency**2)
-    waves = np.cos(2 * np.pi * frequency * np.arange(-REACH, REACH + 1))
-    found = waves @ inverse_filter(sigma).sum(axis=0)
-    assert_allclose(found, expected[:, 0], rtol=0.05)
-
-
 def test_only_the_object_and_what_surrounds_it_is_needed():
     """The observations of a disc are the same from the whole images as from a mask and the pixels
     around it.
@@ -118,10 +103,8 @@ def test_only_the_object_and_what_surrounds_it_is_needed():
 def test_images_out_of_focus_are_named(sigma, soft):
     """A matte ball before black, whose outline and attached shadows are the only edges."""
     lights = spiral_lights(10, 60)
-    y, x = np.mgrid[-1 : 1 : SIDE * 1j, -1 : 1 : SIDE * 1j] / 0.8
-    mask = np.hypot(x, y) < 1
-    normals = np.stack((x, -y, np.sqrt(np.maximum(1 - x**2 - y**2, 0))), axis=2)
-    images = np.moveaxis(np.maximum(normals @ lights.T, 0) * mask[..., None], 2, 0)
+    normals, mask = ball((SIDE, SIDE), 47.5, 47.5, 38)
+    images = np.moveaxis(shade(normals, lights) * mask[..., None], 2, 0)
     images = blurred(images, sigma) + 0.002 * np.random.default_rng(1).normal(size=images.shape)
     capture = prepare_capture(open_arrays(images.clip(0), lights, mask))
     assert [each.code for each in capture.warnings].count("soft_images") == soft

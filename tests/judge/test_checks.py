@@ -1,58 +1,23 @@
-"""The sample that checks see, and checks of single facts: equal images, crowded lights, unequal
-intensities.
-"""
+"""The sample that checks use, of captures with and without a mask."""
 
 import numpy as np
 from pytest import approx
 
 from judged import warnings_of
-from scenes import (
-    cap_directions,
-    directions_at,
-    on_sphere,
-    parametrize,
-    ring_lights,
-    shade,
-    spiral_lights,
-)
+from scenes import ball, parametrize, shade, spiral_lights
 from splinecli.capture.arrays import open_arrays
 from splinecli.capture.sample import CLOSEUP_SIDE, Sample, closeup_of, leave_out_background
-from splinecli.judge.checks import light_spread, repeated_images
 from splinecli.recipe import prepare_capture
-
-
-def test_the_same_image_twice():
-    observations = shade(
-        cap_directions(5000, 60), spiral_lights(10, 50, 12), gloss=0.2, noise=0.004
-    )
-    assert repeated_images(observations) == []
-    observations[:, [5, 7]] = observations[:, [2]]
-    assert repeated_images(observations) == [(2, 5), (2, 7)]
-
-
-def test_the_spread_of_lights():
-    # x and y have a mean square of 1/4, z of 1/2.
-    assert light_spread(ring_lights(8, 45))[0] == approx(0.5)
-    arc = np.array(
-        [(np.sin(a), 0.02 * (-1) ** k, np.cos(a)) for k, a in enumerate(np.linspace(-0.8, 0.8, 8))]
-    )
-    assert light_spread(arc)[0] == approx(0.02, abs=1e-3)
-    assert not light_spread(arc)[1]
-    cone = np.array([(0.1 * np.cos(a), 0.1 * np.sin(a), 1) for a in np.linspace(0, 6, 9)])
-    spread, in_cone = light_spread(cone)
-    assert in_cone and spread < 0.1
 
 
 def ball_before(background, size=80):
     """Return images (F, H, W) of a matte ball before a noisy plane of some brightness, lights and
     its mask.
     """
-    lights = directions_at(np.arange(12) * 2.4, np.arccos(0.8))
-    y, x = np.mgrid[2.2 : -2.2 : size * 1j, -2.2 : 2.2 : size * 1j]
-    mask = np.hypot(x, y) < 0.97
-    normals = on_sphere(x, y)
+    lights = spiral_lights(12, 45, 30)
+    normals, mask = ball((size, size), (size - 1) / 2, (size - 1) / 2, size / 4.5)
     images = np.random.default_rng(0).uniform(0, 2 * background, (12, size, size))
-    images[:, mask] = 0.8 * np.maximum(normals[mask] @ lights.T, 0).T
+    images[:, mask] = 0.8 * shade(normals[mask], lights).T
     return images, lights, mask
 
 

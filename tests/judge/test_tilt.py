@@ -4,9 +4,11 @@ import numpy as np
 from pytest import approx
 from scipy.spatial.transform import Rotation
 
-from scenes import cap_directions, parametrize, sphere, tilted
+from judged import judgement_of
+from scenes import as_capture, bumps, cap_directions, parametrize, sphere
 from splinecli.judge.tilt import curl_of, find_tilt, fitted_map
 from splinecli.maths.normals import angle_between_deg
+from splinecli.records.capture_warnings import LIGHTS_TILTED
 
 SIZE = 72
 LIGHTS = cap_directions(12, 50, 3, even=True)
@@ -14,10 +16,7 @@ LIGHTS = cap_directions(12, 50, 3, even=True)
 
 def surface(name):
     if name == "bumps":
-        y, x = np.mgrid[:SIZE, :SIZE] / SIZE * 9
-        heights = np.sin(x) * np.cos(0.7 * y) + 0.6 * np.sin(1.3 * x + 2 * y)
-        down, right = np.gradient(heights * 5)
-        return tilted(-right, down).reshape(-1, 3), np.ones((SIZE, SIZE), bool)
+        return bumps(SIZE).reshape(-1, 3), np.ones((SIZE, SIZE), bool)
     normals, inside = sphere(SIZE)
     return np.float64(normals[inside]), inside
 
@@ -49,6 +48,19 @@ def test_right_lights_are_not_tilted(name):
     normals, mask = surface(name)
     tilt = find_tilt(fitted_map((normals @ LIGHTS.T).clip(0), mask, LIGHTS), mask)
     assert tilt.degrees < 3 or tilt.left > 0.9
+
+
+def test_a_capture_under_tilted_lights_is_warned_of_and_mended():
+    normals, mask = surface("ball")
+    observed = (normals @ LIGHTS.T).clip(0)
+    right, tilted_by_15 = (
+        judgement_of(as_capture(observed, lights, mask), intensities=np.ones(12))
+        for lights in (LIGHTS, turned(15, 200))
+    )
+    assert right.warnings == ()
+    (warning,) = tilted_by_15.warnings
+    assert warning.kind is LIGHTS_TILTED and warning.error_deg == approx(15, abs=3)
+    assert angle_between_deg(tilted_by_15.mended_lights, LIGHTS).max() < 3
 
 
 def test_a_line_of_pixels_shows_no_tilt():

@@ -150,15 +150,6 @@ def test_shipped_weights_estimate_a_bowl_better_without_its_own_light():
         assert without < 0.6 * mean_error_deg()
 
 
-def test_the_refinement_sees_what_is_left():
-    with patch.object(NetworkRefiner, "refine") as refine:
-        estimate_normals(CAPTURE, make_estimator("spline-net"))
-    _, _, lighting_at, *_ = refine.call_args.args
-    assert (
-        np.abs(lighting_at(EVERYWHERE).observations - DIRECT)[INSIDE].mean() < 0.5 * INDIRECT.mean()
-    )
-
-
 def test_the_refinement_net_learns_from_what_it_sees_in_use():
     estimator = make_estimator("spline-net", MethodOptions(precision="float32"))
     features = pixel_features(

@@ -4,49 +4,22 @@ import numpy as np
 from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
-from scenes import cap_directions, parametrize, sphere, tilted, vectors
+from scenes import bumps, cap_directions, parametrize, sphere
 from splinecli.estimate.light_descent import best_lights
 from splinecli.lights.least_curl import (
     Lights,
-    curl_terms,
     differ_by_deg,
     lights_of_least_curl,
-    normal_derivatives,
 )
 from splinecli.maths.normals import unit
 
 SIZE = 64
 
 
-def bumps():
-    """Return the normals (P, 3) and the mask of a relief that fills the image."""
-    y, x = np.mgrid[:SIZE, :SIZE] / SIZE * 9
-    down, right = np.gradient(5 * np.sin(x) * np.cos(0.7 * y) + 3 * np.sin(1.3 * x + 2 * y))
-    normals = tilted(-right, down).reshape(-1, 3)
-    return normals, np.ones((SIZE, SIZE), np.bool_)
-
-
-def test_normals_of_a_surface_have_no_curl_and_turned_ones_do():
-    normals, mask = bumps()
-    derivatives = normal_derivatives(normals.reshape(SIZE, SIZE, 3), mask, most=1000)
-    matrices = np.stack(
-        (
-            np.eye(3),
-            # a generalised bas-relief transformation of normals
-            np.linalg.inv(vectors("1 0 0; 0 1 0; 0.2 -0.1 0.7")).T,
-            Rotation.from_euler("x", 20, degrees=True).as_matrix(),
-            Rotation.from_euler("z", 30, degrees=True).as_matrix(),
-        )
-    )
-    curls = curl_terms(derivatives, matrices, least_z=0.05, least_share=0.5).sum(axis=1)
-    assert curls[:2].max() < 0.02
-    assert curls[2:].min() > 0.07
-
-
 @parametrize("spread", [0.0, 0.1])
 def test_a_relief_shows_its_lights_whatever_the_guess(spread):
     """A guess that is 40 degrees off does not matter, but lamps that differ by a tenth do."""
-    normals, mask = bumps()
+    normals, mask = bumps(SIZE).reshape(-1, 3), np.ones((SIZE, SIZE), np.bool_)
     rng = default_rng(2)
     true = cap_directions(12, 50, 3, even=True)
     intensities = np.exp(spread * rng.normal(size=12))

@@ -1,6 +1,4 @@
-"""Materials of spheres shaded by an independent implementation of Lambert's law and GGX, and of a
-rendered scene.
-"""
+"""Materials of spheres shaded by an independent implementation of Lambert's law and GGX."""
 
 import numpy as np
 import pytest
@@ -24,7 +22,6 @@ from scenes import (
     write_capture,
 )
 from splinecli import estimate_material
-from splinecli.capture import open_capture
 from splinecli.errors import UsageError
 from splinecli.estimate.inference import estimate_normals
 from splinecli.estimate.methods import make_estimator
@@ -39,9 +36,9 @@ from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 from splinecli.pipeline.integrate import integrate_normal_map
 from splinecli.pipeline.options import EvaluateOptions, IntegrateOptions
-from splinecli.recipe import prepare_capture, read_capture
+from splinecli.recipe import read_capture
 from splinecli.records.output_files import MAPS
-from splinecli.results.maps import make_map, map_files
+from splinecli.results.maps import map_files
 from splinecli.results.material import material_facts, material_warnings
 from splinecli.workshop.synthesis.pixels import PixelGenerator, PixelGeneratorConfig
 
@@ -275,38 +272,6 @@ def test_a_black_capture_has_some_material(tmp_path):
     for name in ("base_colour", "roughness", "metalness", "specular", "confidence"):
         assert np.isfinite(getattr(found, name)).all()
     assert found.confidence.max() < 0.1
-
-
-def test_a_rendered_scene(tmp_path):
-    """A shape and materials of the renderer, with indirect light. A constant roughness of 0.5 is
-    wrong by 0.24.
-    """
-    pytest.importorskip("embreex")
-    from splinecli.workshop.synthesis.scenes import SceneConfig, draw_scene, render_scene
-
-    config = SceneConfig(size=32, lights=12, samples=2, directions=8, bounces=1)
-    scene = draw_scene(7100, 3, config)
-    rendered = render_scene(scene, config)
-    wrong = []
-    for name in ("specular", "metallic"):
-        observations = rendered.observations[name]
-        found = maps.estimate_material(
-            rendered.mask,
-            rendered.normals,
-            scene.lights,
-            lambda rows, o=observations: PixelLighting(o[rows], scene.lights),
-        )
-        true = scene.materials[name]
-        wrong.append(abs(float(np.median(found.roughness)) - float(true.roughness.median())))
-    assert np.mean(wrong) < 0.25
-
-
-def test_colours_are_read_once_more(glossy):
-    source = open_capture(glossy)
-    steps = []
-    estimate = estimate_normals(prepare_capture(source), make_estimator("ls"))
-    assert make_map(MAPS["material"], source, estimate, lambda: steps.append(1)) is not None
-    assert len(steps) == len(LIGHTS)
 
 
 def relit(folder, n_lights):

@@ -52,10 +52,6 @@ def test_directx_flips_green_alone():
     normals, mask = random_normals(64).reshape(8, 8, 3), np.ones((8, 8), bool)
     flipped = encode_picture(normals, mask, convention="directx")
     assert_array_equal(flipped, encode_picture(normals * (1, -1, 1), mask))
-    opengl = encode_picture(normals, mask)
-    assert_array_equal(flipped[..., [0, 2]], opengl[..., [0, 2]])
-    # Green runs the other way: the two add up to full scale, but for rounding.
-    assert np.abs(flipped[..., 1].astype(int) + opengl[..., 1] - 65535).max() <= 1
 
 
 @parametrize("convention", "opengl directx")
@@ -157,17 +153,6 @@ def test_a_cylinder_and_a_saddle():
     # z = x y / R, whose curvature at the middle is -1/R^2 (Gauss) and 0 (mean).
     saddle = curvature_of_normals(tilted(-Y / 300, -X / 300), everywhere)[SIZE // 2, SIZE // 2]
     assert saddle[1] == approx(-1 / 300**2, rel=0.02) and abs(saddle[0]) < 1e-6
-
-
-def test_noise_falls_with_the_square_of_sigma():
-    noise = default_rng(1).normal(size=(*X.shape, 3))
-    noisy = np.float32(unit(0.02 * noise + np.array((0, 0, 1))))
-    inner = np.hypot(X, Y) < 40
-    spread = [
-        curvature_of_normals(noisy, np.ones(X.shape, bool), sigma)[inner][:, 0].std()
-        for sigma in (1.5, 3)
-    ]
-    assert spread[0] / spread[1] == approx(4, rel=0.3)
 
 
 def test_a_steep_normal_has_no_slope():

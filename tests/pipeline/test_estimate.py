@@ -10,10 +10,9 @@ from scenes import Teacher, cap_directions, parametrize, refuses, spiral_lights
 from splinecli.capture import Capture
 from splinecli.errors import UsageError
 from splinecli.estimate.methods.estimator import LeastSquares, StudentSize
-from splinecli.estimate.refinement.refiner import MARGIN, TILE
 from splinecli.pipeline import infer
 from splinecli.pipeline.expected_seconds import AUTOMATIC_FROM, expected_seconds
-from splinecli.pipeline.infer import REFINED_PIXELS, distil_for
+from splinecli.pipeline.infer import distil_for
 from splinecli.pipeline.info import ORIGINS
 from splinecli.records.output_files import MAPS
 from splinecli.records.white_level import Origin
@@ -105,10 +104,6 @@ def test_a_large_capture_with_few_lit_pixels_is_left_to_the_network():
     with refuses("matte: only 100 pixels are lit, which is too few to distil", UsageError):
         distil_for(dark, Slow(), True)
     assert distil_for(dark, Slow(), None) == (None, [])
-
-
-def test_the_most_refined_pixels_are_a_tile_with_its_margin():
-    assert REFINED_PIXELS == (TILE + 2 * MARGIN) ** 2
 
 
 def test_every_origin_of_a_white_level_has_words():

@@ -223,12 +223,6 @@ def dense(normals, mask, discontinuity, iterations):
     return heights
 
 
-def test_least_squares_is_the_dense_solution():
-    normals, mask = bumps(14, 19, usable=True), holes(14, 19)
-    found = integrate_normals(normals, mask, discontinuity=0)[mask]
-    assert_allclose(found, dense(normals, mask, 0, 1), atol=1e-4)
-
-
 def test_a_prior_is_the_dense_solution():
     normals, mask = bumps(14, 19, usable=True), holes(14, 19)
     prior = default_rng(2).normal(size=mask.shape)
@@ -298,6 +292,9 @@ def test_bilateral_is_the_dense_solution():
     normals, mask = bumps(12, 17, usable=True), holes(12, 17)
     found = integrate_normals(normals, mask)[mask]
     least_squares = dense(normals, mask, 0, 1)
+    assert_allclose(
+        integrate_normals(normals, mask, discontinuity=0)[mask], least_squares, atol=1e-4
+    )
     expected = dense(normals, mask, 2, 200)
     assert np.abs(expected - least_squares).max() > 0.5
     assert_allclose(found, expected, atol=5e-3)
@@ -325,15 +322,6 @@ def test_backward_normals_are_bridged():
     wrong = default_rng(3).uniform(size=mask.shape) < 0.05
     normals[wrong & mask] = unit(np.array([0.7, 0.1, -0.7]))
     assert error_share(integrate_normals(normals, mask), truth, mask) < 5e-3
-
-
-@until_nothing_moves
-def test_turning_the_picture_turns_the_surface():
-    normals, mask = bumps(18, 25, 4), holes(18, 25, 5)
-    x, y, z = np.moveaxis(normals, -1, 0)
-    found = integrate_normals(normals, mask)
-    again = integrate_normals(np.rot90(np.stack((-y, x, z), axis=-1)), np.rot90(mask))
-    assert_allclose(again, np.rot90(found), atol=5e-3)
 
 
 def test_without_a_mask_all_normals_count_and_progress_is_reported():
@@ -376,7 +364,6 @@ def test_bad_input(arguments, message):
     [
         ((NORMALS[..., 0],), "(3, 4), expected (H, W, 3)"),
         ((NORMALS[..., :2], MASK), "(3, 4, 2), expected (3, 4, 3) for this mask"),
-        ((NORMALS, MASK.T), "(3, 4, 3), expected (4, 3, 3) for this mask"),
         ((NORMALS, np.uint8(MASK)), "the mask is uint8 (3, 4), expected bool (H, W)"),
         ((NORMALS, MASK, np.eye(4)), "the camera matrix has shape (4, 4), expected (3, 3)"),
     ],

@@ -111,13 +111,6 @@ def test_steps_are_left_open(camera):
         surface_mesh(depth, mask, largest_step=-1)
 
 
-def test_pixels_without_triangles():
-    for mask in (np.eye(4, dtype=bool), np.ones((1, 5), bool)):
-        mesh = surface_mesh(np.zeros(mask.shape), mask)
-        assert mesh.triangles.shape == (0, 3)
-        assert_array_equal(mesh.normals, np.tile((0, 0, 1), (len(mesh.vertices), 1)))
-
-
 @parametrize("camera", [None, CAMERA])
 def test_attributes_of_vertices(camera):
     colours, normal_map, mask = COLOURS, np.zeros((15, 20, 3)), RAGGED
@@ -140,27 +133,6 @@ def test_normals_of_the_triangles():
     mesh = surface_mesh(0.5 * COLUMNS - 2.0 * ROWS, np.ones((15, 20), bool))
     slope = np.array((-0.5, -2, 1))
     assert_allclose(mesh.normals, np.tile(slope / np.linalg.norm(slope), (300, 1)), atol=1e-6)
-
-
-RNG = default_rng(0)
-MASK = np.hypot(*np.mgrid[-20:20, -25:25]) < 18
-
-
-@parametrize("share", [1.0, 0.01])
-def test_the_number_of_blocks_is_bounded_for_scattered_pixels(share):
-    mask = RNG.random((300, 400)) < share
-    assert 50 <= np.count_nonzero(Blocks.over(mask, 100).mask) <= 200
-
-
-@parametrize("step", [1, 3, 7])
-def test_samples_are_those_of_scipy(step):
-    blocks = Blocks.of_step(MASK, step)
-    values = RNG.random((np.count_nonzero(blocks.mask), 2)).astype(np.float32)
-    found = blocks.sample(blocks.spread(values), *np.nonzero(MASK))
-    for column, of_blocks in zip(found.T, values.T, strict=True):
-        depth = np.full(blocks.mask.shape, np.nan)
-        depth[blocks.mask] = of_blocks
-        assert_allclose(column, blocks.interpolate(depth, MASK), atol=1e-6)
 
 
 SIDE = 90
@@ -206,6 +178,16 @@ def decimated(camera):
     return decimated_mesh(
         *surface, n_triangles=len(surface_mesh(*surface).triangles) // 20, normal_map=normal_map
     )
+
+
+@parametrize("step", [1, 3, 7])
+def test_samples_of_blocks_are_those_of_scipy(step, rng):
+    mask = np.hypot(*np.mgrid[-20:20, -25:25]) < 18
+    blocks = Blocks.of_step(mask, step)
+    depth = np.full(blocks.mask.shape, np.nan, np.float32)
+    depth[blocks.mask] = rng.random(np.count_nonzero(blocks.mask))
+    found = blocks.sample(blocks.spread(depth[blocks.mask][:, None]), *np.nonzero(mask))
+    assert_allclose(found[:, 0], blocks.interpolate(depth, mask), atol=1e-6)
 
 
 def test_normals_relit_from_the_file(decimated, rng):

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.random import default_rng
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_array_equal
 
 from scenes import directions_at, parametrize, refuses, run_python, shade, sphere
 from splinecli.capture.formats.facts import read_header
@@ -18,7 +18,7 @@ from splinecli.capture.formats.film import (
     is_film,
     read_frames,
 )
-from splinecli.maths.transfer import BT709, decode_transfer
+from splinecli.maths.transfer import BT709
 from splinecli.pictures.maps import encode_png
 
 SIZE = 96
@@ -83,12 +83,6 @@ def test_blurred_overexposed_and_dark_frames_are_not_chosen(tmp_path):
     frames[dark] //= 8
     chosen = choose_frames(write_film(tmp_path / "clip.avi", frames))
     assert not {*blurred, *bright, *dark}.intersection(chosen)
-
-
-def test_the_curve_is_undone():
-    linear = np.linspace(0, 1, 256)
-    stored = np.float32(encode_bt709(linear))
-    assert_allclose(decode_transfer(stored, BT709), linear, atol=2e-4)
 
 
 @parametrize("number, curve", [(1, BT709), (8, 1.0), (13, None)])

@@ -15,7 +15,6 @@ from distributions import seeded
 from scenes import (
     assert_unit,
     cap_directions,
-    directions_at,
     parametrize,
     ring_lights,
     spiral_lights,
@@ -33,7 +32,7 @@ from splinecli.estimate.fits.least_squares import (
 )
 from splinecli.estimate.methods import MethodOptions, make_estimator
 from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.maths.robust import inverse_3x3, multiply_symmetric
+from splinecli.maths.robust import inverse_3x3
 
 ROBUST = ("iw12", "l1", "ls-trimmed")
 
@@ -143,6 +142,17 @@ def test_weighted_step_against_lapack(rng):
         assert_allclose(covariance[:, i], entries, rtol=1e-5, atol=1e-9 * np.trace(inverse))
 
 
+@parametrize("rank", [0, 1, 2])
+def test_inverse_of_a_singular_matrix_is_positive(rank, rng):
+    factors = rng.normal(size=(3, rank, 100))
+    entries = [
+        (factors[i] * factors[j]).sum(axis=0)
+        for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    ]
+    inverted = np.stack(inverse_3x3(entries, 1e-6))
+    assert np.isfinite(inverted).all() and (inverted[:3] > 0).all()
+
+
 def normals_under(limit_deg, count):
     return torch.tensor(cap_directions(count, limit_deg), dtype=torch.float32)
 
@@ -159,16 +169,6 @@ def error_deg(scaled_normals, truth):
 
 def to_unit_scale(observations):
     return observations / observations.amax(dim=1, keepdim=True)
-
-
-def test_pixels_without_shadow_are_recovered_with_their_albedo():
-    truth, lights = normals_under(30, 500), ring(10, 40)
-    observations = to_unit_scale(truth @ lights.T)
-    assert observations.min() > 0.05  # no light is taken for a shadow
-    scaled = fit_lambertian(observations, lights)
-    assert error_deg(scaled, truth).max() < 0.1
-    albedo = 1 / (truth @ lights.T).amax(dim=1)
-    assert_close(scaled.norm(dim=1), albedo, rtol=1e-3, atol=0)
 
 
 def test_shadows_over_a_third_of_the_lights_are_seen_through():
@@ -193,58 +193,6 @@ def test_a_highlight_counts_less_than_in_least_squares():
     assert error_deg(fit_lambertian(observations, lights), truth).mean() < 0.1 * plain.mean()
 
 
-ROWS, COLUMNS = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
-"""Places of xx, yy, zz, xy, xz, yz in a matrix."""
-
-
-def positive_matrices(count, rank=3):
-    factors = default_rng(0).normal(size=(count, 3, rank))
-    return np.asarray(factors @ factors.transpose(0, 2, 1))
-
-
-def inverse(matrices, smallest, library):
-    entries = [matrices[:, i, j] for i, j in zip(ROWS, COLUMNS, strict=True)]
-    if library == "torch":
-        entries = [torch.from_numpy(entry) for entry in entries]
-    result = np.empty_like(matrices)
-    for i, j, entry in zip(ROWS, COLUMNS, inverse_3x3(entries, smallest), strict=True):
-        result[:, i, j] = result[:, j, i] = np.asarray(entry)
-    return result
-
-
-def test_inverse():
-    matrices = positive_matrices(1000)
-    expected = np.linalg.inv(matrices)
-    size = np.abs(expected).max(axis=(1, 2), keepdims=True)
-    # The worst of a thousand such matrices has a condition number of about 1e7.
-    assert_allclose(inverse(matrices, 1e-14, "numpy") / size, expected / size, atol=1e-8)
-
-
-def test_numpy_and_torch_agree_to_the_last_bit():
-    matrices = positive_matrices(1000)
-    assert (
-        inverse(matrices, 1e-12, "numpy").tobytes() == inverse(matrices, 1e-12, "torch").tobytes()
-    )
-
-
-@parametrize("rank", [0, 1, 2])
-@parametrize("dtype", [np.float32, np.float64])
-def test_inverse_of_a_singular_matrix_is_positive(rank, dtype):
-    inverted = inverse(positive_matrices(100, rank).astype(dtype), 1e-6, "numpy")
-    assert np.isfinite(inverted).all()
-    assert (np.diagonal(inverted, axis1=1, axis2=2) > 0).all()
-
-
-def test_product_with_a_vector():
-    matrices, vectors = positive_matrices(50), default_rng(1).normal(size=(50, 3))
-    entries = [matrices[:, i, j] for i, j in zip(ROWS, COLUMNS, strict=True)]
-    found, expected = (
-        multiply_symmetric(entries, vectors.T),
-        np.einsum("pij,pj->ip", matrices, vectors),
-    )
-    assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
-
-
 LIGHTS = torch.tensor(spiral_lights(10, 55))
 SIGNS = alternating_signs(LIGHTS)
 
@@ -264,7 +212,7 @@ def test_the_change_is_half_the_difference_of_two_halves():
     """On a ring, the sums over either half are the same. So least squares with one half is the
     oracle.
     """
-    lights = torch.tensor(directions_at(np.radians(30 + 45 * np.arange(8)), np.radians(40)))
+    lights = torch.tensor(ring_lights(8, 40, np.radians(30)))
     _, observations = noisy_pixels(lights, 0.001)
     first, second = (
         normalize(observations[:, half::2] @ torch.linalg.pinv(lights[half::2]).T, dim=1)
@@ -283,8 +231,7 @@ def test_the_change_is_half_the_difference_of_two_halves():
 @parametrize("count", [4, 5, 10, 40])
 def test_noise_is_as_large_as_the_random_errors(count, square):
     """Also on a ring of four lights, whose residuals alternate as the signs of the halves do."""
-    ring = directions_at(2 * np.pi * np.arange(count) / count, np.radians(35))
-    lights = torch.tensor(ring if square else spiral_lights(count, 55))
+    lights = torch.tensor(ring_lights(count, 35) if square else spiral_lights(count, 55))
     truth, observations = noisy_pixels(lights, 0.01)
     found = compare_halves(observations, lights, alternating_signs(lights))
     noise, error = (

@@ -71,13 +71,6 @@ def test_exact_under_its_model():
     assert angle_between_deg(estimate(OBSERVATIONS, LIGHTS), TRUTH).max() < 0.02
 
 
-def test_highlights_in_the_brightest_observations_change_nothing():
-    bright = with_highlights(OBSERVATIONS, untouched=60)
-    assert angle_between_deg(LeastSquares().estimate(bright, LIGHTS), TRUTH).mean() > 20
-    # They raise the threshold of shadows, so fewer observations are kept than without them.
-    assert angle_between_deg(estimate(bright, LIGHTS), TRUTH).max() < 0.1
-
-
 @parametrize("count, cast", [(4, 0.0), (6, 0.0), (10, 0.0), (64, 0.1)])
 def test_exact_on_lambertian_scenes_with_shadows(count, cast):
     lights, truth = cap_directions(count, 70, 3, even=True), cap_directions(300, 60, 4, even=True)
@@ -102,9 +95,6 @@ def test_noise_and_highlights_cost_less_than_in_least_squares(count, untouched):
     )
 
 
-ON_CPU = MethodOptions(device="cpu")
-
-
 def bernstein(x, degree):
     return np.stack(
         [comb(degree, i) * x**i * (1 - x) ** (degree - i) for i in range(degree + 1)], axis=-1
@@ -120,21 +110,6 @@ def rendered(normals, lights, seed):
     shading = (normals @ lights.T).clip(0)
     observations = shading * (1 + strength * (normals @ halfway(lights).T).clip(0) ** exponent)
     return observations / observations.max(axis=1, keepdims=True)
-
-
-def test_lambertian_is_exact():
-    for count in (4, 10, 96):
-        truth, lights = (
-            cap_directions(300, 70, 0, even=True),
-            cap_directions(count, 60, 1, even=True),
-        )
-        observations = (truth @ lights.T).clip(0)
-        truth = truth[(observations > 0).sum(axis=1) >= 4]
-        observations = (truth @ lights.T).clip(0) * 7
-        # What is left is float32 and, for lights nearly in a plane, the ridge.
-        found = make_estimator("ia14", ON_CPU).estimate(np.float32(observations), lights)
-        assert np.median(angle_between_deg(found, truth)) < 1e-4
-        assert angle_between_deg(found, truth).max() < 0.02
 
 
 def objective_of(intensities, lights, prior_weight):
@@ -159,15 +134,10 @@ def objective_of(intensities, lights, prior_weight):
 
 
 @parametrize("count", [10, 96])
-@parametrize("kind", "random rendered")
-def test_optimum_is_the_librarys(kind, count):
+def test_optimum_is_the_librarys(count):
     lights = cap_directions(count, 60, 5, even=True)
     truth = cap_directions(100, 60, 6, even=True)
-    if kind == "random":
-        observations = default_rng(7).uniform(size=(100, count))
-        observations /= observations.max(axis=1, keepdims=True)
-    else:
-        observations = rendered(truth, lights, 7)
+    observations = rendered(truth, lights, 7)
     normals, increments = fit_ia14(torch.as_tensor(observations), torch.as_tensor(lights))
     for intensities, n, d in zip(observations, normals.numpy(), increments.numpy(), strict=True):
         hessian, mean, monotone, used = objective_of(intensities, lights, prior_weight=0.01)

@@ -9,14 +9,13 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
-from scenes import FOUR_LIGHTS, assert_unit, parametrize, refuses, spiral_lights, vectors
+from scenes import FOUR_LIGHTS, assert_unit, parametrize, refuses, vectors
 from splinecli.errors import ModelError, UsageError
 from splinecli.estimate.methods import MethodOptions, make_estimator, method_names
-from splinecli.estimate.methods.estimator import LeastSquares
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.lights.lighting import PixelLighting
-from splinecli.maths.normals import angle_between_deg, unit
+from splinecli.maths.normals import angle_between_deg
 from splinecli.workshop.save_weights import save_weights
 from tiny_networks import TINY
 
@@ -165,12 +164,3 @@ def test_a_pixel_may_have_lights_of_its_own(name, glossy_pixels):
 def _about_view_axis(angle):
     cosine, sine = np.cos(angle), np.sin(angle)
     return np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
-
-
-@parametrize("count", [3, 4, 10, 96])
-def test_solves_the_normal_equations(count, rng):
-    observations = rng.uniform(size=(50, count))
-    directions = spiral_lights(count)
-    estimate = LeastSquares().estimate(observations, directions)
-    expected = np.linalg.lstsq(directions, observations.T, rcond=None)[0].T
-    assert_allclose(estimate, unit(expected), atol=1e-12)

@@ -1,4 +1,4 @@
-"""The paper's size: its published numbers of parameters, and the authors' weights.
+"""The authors' weights of the paper's size.
 
 The authors' architecture, built here from its description, is the oracle of the import: both
 networks get random weights, are saved as the authors save theirs, imported, and asked the same
@@ -19,7 +19,6 @@ from torch.testing import assert_close
 from distributions import seeded
 from scenes import parametrize, refuses
 from splinecli.errors import ModelError
-from splinecli.estimate.networks.li_ne_net import PaperLINet, PaperNENet
 from splinecli.workshop.import_weights import import_official
 
 SIDE = 32
@@ -202,17 +201,11 @@ def test_files_of_old_and_without_statistics(authors, imported, changed, tmp_pat
     "of, changes, message",
     [
         (0, {"main.0.weight": None}, "has no 'main.0.weight'"),
-        (0, {"main.9.main.4.bias": None}, "has no 'main.9.main.4.bias'"),
         (0, {"main.0.bias": torch.zeros(64)}, "has 'main.0.bias', which the network does not have"),
         (
             0,
             {"main.3.weight": torch.zeros(128, 64, 3, 3)},
             r"\(128, 64, 3, 3\), expected \(128, 64, 4, 4\)",
-        ),
-        (
-            0,
-            {"main.1.running_mean": torch.zeros(63)},
-            r"'main.1.running_mean' has the shape \(63,\)",
         ),
         (
             0,
@@ -227,8 +220,6 @@ def test_files_of_old_and_without_statistics(authors, imported, changed, tmp_pat
         (0, {"main.1.bias": torch.full((64,), 1e6)}, "'main.1.bias' has values .* too large"),
         (0, {"main.1.bias": torch.zeros(64, dtype=torch.int64)}, "'main.1.bias' is of torch.int64"),
         (1, {"conv2.bias": None, "dense.1.weight": None}, "has no 'conv2.bias', 'dense.1.weight'"),
-        (1, {"dense.0.weight": torch.zeros(128, 80)}, "'dense.0.weight' has the shape"),
-        (1, {"dense.2.weight": torch.zeros(1)}, "has 'dense.2.weight'"),
         (
             1,
             {f"{n}": torch.zeros(1) for n in range(7)},
@@ -320,14 +311,3 @@ def test_files_that_are_no_checkpoints(files, tmp_path):
     ):
         with refuses(reason, ModelError):
             import_official(missing, files[1])
-
-
-@parametrize(
-    "network, theirs, published",
-    [(PaperLINet(), AuthorsLINet(), 8.40), (PaperNENet(2, 32), AuthorsNENet(), 2.65)],
-)
-def test_the_published_number_of_parameters(network, theirs, published):
-    count, expected = (
-        sum(parameter.numel() for parameter in one.parameters()) for one in (network, theirs)
-    )
-    assert count == expected and count / 1e6 == pytest.approx(published, abs=0.01)

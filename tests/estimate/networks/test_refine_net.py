@@ -10,7 +10,6 @@ from torch.testing import assert_close
 from distributions import seeded
 from scenes import parametrize
 from splinecli.estimate.fits.least_squares import alternating_signs
-from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.refine_net import (
     COARSEST,
     FEATURE_CHANNELS,
@@ -19,8 +18,6 @@ from splinecli.estimate.networks.refine_net import (
     split_features,
     with_refined,
 )
-from splinecli.estimate.networks.set_branch import ContextLayer
-from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.refinement.features import (
     MapTurn,
     refine_features,
@@ -142,25 +139,6 @@ def test_outside_of_the_mask_is_outside_of_the_image(twice):
         assert_close(within[box], alone, atol=1e-5, rtol=1e-5)
 
 
-@parametrize("twice", [False, True])
-@parametrize("turned", [False, True])
-def test_nothing_beyond_the_reach_counts(turned, twice):
-    """Along a strip that is as wide as two of the coarsest cells."""
-    net = random_net(twice=twice).double()
-    size = 2 * net.reach + COARSEST
-    features, mask = random_maps(*((2 * COARSEST, size) if turned else (size, 2 * COARSEST)))
-    before = net(features.double(), mask.double())
-    for place in (0, size - 1):
-        changed = features.clone().double()
-        changed.select(-1 if turned else -2, place).add_(1)
-        after = net(changed, mask.double())
-        far = torch.arange(size).sub(place).abs() >= net.reach
-        for one, other in zip(before, after, strict=True):
-            difference = (one - other).abs().amax(dim=(0, 1, 2 if turned else 3))
-            assert difference[far].max() == 0
-            assert difference.max() > 0
-
-
 SEES = TINY | {"map_size": 16, "set_width": 16, "set_layers": 2, "error_head": True}
 
 
@@ -173,21 +151,6 @@ def pixels(count, seed=0):
 @pytest.fixture(scope="module")
 def network():
     return random_network(**SEES, sees_capture=True)
-
-
-def test_at_first_a_capture_says_nothing():
-    alone, seeing = (
-        SplineNet(NetworkConfig(**SEES, sees_capture=sees)).eval() for sees in (False, True)
-    )
-    for parameter in alone.parameters():  # the layers that are zero at first, too
-        torch.nn.init.normal_(parameter, std=0.1) if not parameter.any() else None
-    assert not seeing.load_state_dict(alone.state_dict(), strict=False).unexpected_keys
-    assert alone.encode_context(*pixels(3)) is None
-    observations, lights = pixels(12)
-    for found, expected in zip(
-        seeing(observations, lights), alone(observations, lights), strict=True
-    ):
-        assert torch.equal(found, expected)
 
 
 def test_a_sample_of_all_pixels_is_the_capture_itself(network):
@@ -226,26 +189,6 @@ def test_the_exposure_of_a_capture_does_not_matter_but_the_brightness_of_a_pixel
     assert_close(network(37 * observations, lights).normals, whole, atol=1e-5, rtol=0)
     darker = observations * torch.linspace(0.1, 1, 16)[:, None]
     assert (network(darker, lights).normals - whole).abs().max() > 1e-3
-
-
-def test_attention_and_mean_are_those_of_the_formulas():
-    """One capture, computed once more pixel by pixel and head by head in float64."""
-    torch.manual_seed(0)
-    layer = ContextLayer(16).double()
-    torch.nn.init.normal_(layer.join[2].weight)
-    tokens, level = torch.randn(5, 16).double(), torch.randn(5, 1).double()
-    found, _ = layer(tokens, level, 1, None)
-    embedded = layer.embed(torch.cat((tokens, level), dim=1))
-    sample, queries = layer.key_norm(embedded), layer.query_norm(embedded)
-    keys, values = layer.keys_values(sample).chunk(2, dim=1)
-    for pixel in range(5):
-        heads = []
-        for head in range(4):
-            part = slice(4 * head, 4 * head + 4)
-            asked = layer.queries(queries)[pixel, part]
-            heads.append(torch.softmax(keys[:, part] @ asked / 2, dim=0) @ values[:, part])
-        seen = torch.cat((queries[pixel], *heads, layer.pooled(sample).mean(dim=0)))
-        assert_close(found[pixel], tokens[pixel] + layer.join(seen), atol=1e-5, rtol=1e-5)
 
 
 @parametrize(

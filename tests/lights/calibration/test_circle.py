@@ -3,7 +3,6 @@
 import numpy as np
 
 from scenes import parametrize, refuses
-from splinecli.capture import read_image, read_mask
 from splinecli.lights.calibration.circle import Circle, circle_from_mask, find_circles
 
 TRUE = Circle(103.3, 88.7, 61.4)
@@ -57,16 +56,3 @@ def test_normals_of_the_ball():
     normals = Circle(10, 20, 5).normals(np.array([10.0, 13, 10, 16]), np.array([20.0, 20, 16, 20]))
     np.testing.assert_allclose(normals[:3], [(0, 0, 1), (0.6, 0, 0.8), (0, 0.8, 0.6)], atol=1e-12)
     assert np.isnan(normals[3]).any()
-
-
-def test_real_balls(shared_data, record_property):
-    # PSBox's own circles; their y counts from the lower edge.
-    for number in (1, 2):
-        folder = shared_data / f"psbox/LightProbe-{number}"
-        x, y, radius = (float(word) for word in (folder / "circle_data.txt").read_text().split())
-        picture = read_image(folder / "ref.JPG").mean(axis=2)
-        found = find_circles(picture)[0]
-        record_property(f"ball {number}", repr(found))
-        assert_close(found, Circle(x, len(picture) - y, radius), 0.01 * radius)
-    found = circle_from_mask(read_mask(shared_data / "uw/chrome/mask.png"))
-    assert found.visible > 0.98

@@ -4,13 +4,12 @@ The oracles are the law of reflection under a lamp of known position, and lights
 known.
 """
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from scenes import directions_at, parametrize, pinhole, spiral_lights, vectors, write_image
+from scenes import directions_at, parametrize, pinhole, spiral_lights, write_image
 from splinecli.lights.calibration.balls import (
     DISTANT,
     SHORTEST_LENS,
@@ -26,7 +25,6 @@ from splinecli.lights.calibration.circle import Circle
 from splinecli.lights.calibration.lamps import (
     calibration_lines,
     calibration_report,
-    intersect_rays,
     triangulate_lamps,
 )
 from splinecli.maths.normals import unit
@@ -55,14 +53,6 @@ def calibrate(folder, render_ball, positions, *, known=True):
         files = find_ball_files(folder / name)
         balls.append(calibrate_ball(files, circle=circle, camera_matrix=matrix if known else None))
     return balls
-
-
-def test_rays_that_meet():
-    points = vectors("1 2 5; -3 0.5 4; 0 0 9")
-    starts = np.array([[(-1.0, 0.0, 0.0)] * 3, [(1.0, 0.2, 0.0)] * 3])
-    found, miss = intersect_rays(starts, unit(points - starts))
-    np.testing.assert_allclose(found, points, atol=1e-9)
-    assert miss < 1e-18
 
 
 FIELD = 400.0  # millimetres that the image shows across, on the balls' plane
@@ -213,21 +203,6 @@ def directions():
     zero.
     """
     return unit(np.array([(0.0, 0.0, 1.0)] * 4))
-
-
-def test_one_ball(directions):
-    found = report([ball(directions)])
-    assert json.loads(json.dumps(found)) == found
-    assert found["n_lights"] == 4
-    assert found["disagreement_deg"] is None
-    assert found["compared"] is None
-    assert found["light_intensities"] is None
-    assert found["warnings"] == []
-    assert found["balls"][0]["highlights"][0] == [1.235, 2.0]
-    assert calibration_lines(found) == [
-        "ball: circle 50.0, 40.0, radius 30.0 pixels (from --circle, 100 % of the outline"
-        " visible, spread 0.0 pixels)"
-    ]
 
 
 @parametrize(("degrees", "warned"), [(9.8, False), (10.2, True)])

@@ -13,7 +13,6 @@ from distributions import seeded
 from scenes import parametrize
 from splinecli.maths.observation_map import cell_directions
 from splinecli.workshop.pixel_sets.source import (
-    FILL_ROUNDS,
     PixelSetSource,
     SampledPixels,
     fill_gaps,
@@ -161,15 +160,3 @@ def test_gaps_are_filled_between_lights_and_not_beside_them():
     assert dense.filled.sum() == 4
     assert dense.values[0, 0, 16, 11].item() == approx(0.4)
     assert torch.equal(dense.known, known)
-
-
-def test_nothing_is_filled_outside_the_disc_or_far_from_a_light():
-    _, inside = cell_directions()
-    known = torch.ones(1, 1, 32, 32)
-    known[0, 0, 8:24, 8:24] = 0
-    dense = fill_gaps(torch.full((1, 1, 32, 32), 0.5) * known, known * inside, inside)
-    assert not dense.filled[0, 0][~inside].any()
-    assert not dense.values[0, 0][~inside].any()
-    middle = slice(8 + FILL_ROUNDS, 24 - FILL_ROUNDS)
-    assert not dense.filled[0, 0, middle, middle].any()
-    np.testing.assert_allclose(dense.values[dense.filled > 0], 0.5, rtol=1e-6)

@@ -2,7 +2,6 @@
 
 import json
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -165,17 +164,12 @@ def test_no_changed_byte_goes_unnoticed(make_set, array, entry):
 
 DAMAGED: dict[str, Any] = {
     "pipe": os.mkfifo,
-    "folder": Path.mkdir,
     "link to nothing": lambda path: path.symlink_to("nothing"),
-    "empty": Path.touch,
     "text": lambda path: put(path, "no array"),
     "header": lambda path: path.write_bytes(b"\x93NUMPY\x01\x00\x10\x00{'descr': '<f4',"),
     "archive": lambda path: np.savez(path.with_suffix(".npz"), 1),
-    "0-dimensional": lambda path: np.save(path, np.float32(1)),
-    "text array": lambda path: np.save(path, np.full((40, 30), "x")),
     "too long": lambda path: np.save(path, np.ones((41, 30), np.float32)),
     "complex": lambda path: np.save(path, np.ones((40, 3), np.complex64)),
-    "three axes": lambda path: np.save(path, np.ones((8, 5, 1), bool)),
     "another mask": lambda path: np.save(path, np.ones((3, 5), bool)),
 }
 
@@ -220,10 +214,7 @@ def test_a_damaged_array_is_named(make_set, array, damage):
             None,
             r"manifest\.json: .*Expected `object`, got `null` - at `\$\.entries\[0\]\.sha256`",
         ),
-        ("name", "..", r"manifest\.json: '\.\.' is not the name of a folder"),
-        ("n_lights", "30", r"manifest\.json: .*Expected `int`"),
         ("n_pixels", 0, r"manifest\.json: .*Expected `int` >= 1 - at"),
-        ("recipe", 5, r"manifest\.json: .*Expected `object`"),
         ("name", "d", r"d/observations\.npy: does not match the manifest: found no plain file"),
     ],
 )

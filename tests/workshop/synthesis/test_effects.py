@@ -39,16 +39,11 @@ def test_walls_have_the_stated_shapes():
     assert_uniform(torch.rad2deg(wall.tan_half_width.atan()), 15, 88)
     assert_uniform(wall.softness, 0.01, 0.06)
     assert_uniform(torch.rad2deg(wall.facing[:, 2].asin()), 0, 60)
-    assert_close(wall.facing.norm(dim=1), torch.ones(N))
-    assert_close(wall.azimuth.norm(dim=1), torch.ones(N))
-    assert not wall.azimuth[:, 2].any()
     # It faces back over the pixel.
-    assert dot(wall.facing, wall.azimuth[:1])[0, 0] < 0
     assert ((wall.facing * wall.azimuth).sum(dim=1) < 0).all()
     assert not wall.reflectance[~present].any()
     assert share(wall.has_pixel_material) == approx(0.5, abs=SHARE)
     # What reflects lies on the wall, on the side that faces the pixel.
-    assert_close(wall.towards.norm(dim=1), torch.ones(N))
     along = (wall.towards * wall.azimuth).sum(dim=1)
     assert (wall.towards[present, 2] < wall.tan_height[present, 0] * along[present]).all()
     assert ((wall.facing * wall.towards).sum(dim=1) < 0).all()
@@ -255,10 +250,6 @@ def test_restoring_half_of_the_clipped_pixels():
     changed = (restored != stored).any(dim=1)
     assert share(changed) == approx(0.5, abs=0.08)
     assert not (restored != stored)[~clipped].any()
-    # Seven matte observations determine the others.
-    known = changed & ((valid & ~clipped).sum(dim=1) >= 7)
-    assert known.sum() > 20
-    assert (restored - truth)[known][clipped[known]].abs().max() < 0.02
 
 
 def draw_rigs(kind, pixels, lights):
@@ -285,13 +276,6 @@ def test_half_of_the_draws_have_about_the_usual_number():
         expected = 0.5 * log_uniform(most) + 0.5 * (most >= 12)
         assert (largest <= most).mean() == approx(expected, abs=0.035)
     assert all(counts.min() >= np.floor(0.8 * counts.max()) for counts in draws)
-
-
-def test_directions_are_unit_vectors_above_the_horizon():
-    directions = draw_light_directions(2000, 30, seeded(0))
-    assert directions.shape == (2000, 30, 3) and directions.norm(dim=-1).sub(1).abs().max() < 1e-6
-    # Nothing lies outside 0.996 of the disc, where z = sqrt(1 - 0.996^2) = 0.0894.
-    assert directions[..., 2].min() == approx(0.0894, abs=1e-3)
 
 
 def test_rigs_are_ellipses_of_the_stated_axes():
@@ -336,14 +320,3 @@ def test_lines_lie_nearly_in_a_plane():
     centred = centred_rigs("line", 500, 400)
     across = np.sqrt(np.linalg.eigvalsh(np.einsum("pfi,pfj->pij", centred, centred) / 400)[:, 0])
     assert stats.kstest(np.degrees(np.arcsin(across)), stats.uniform(1, 9).cdf).statistic < 0.1
-
-
-def test_hand_held_lights_come_in_clusters():
-    directions = draw_rigs("hand-held", 500, 12)
-    angles = np.degrees(np.arccos(np.clip(directions @ directions.transpose(0, 2, 1), -1, 1)))
-    angles += 360 * np.eye(12)
-    polar_deg = np.degrees(np.arccos(directions[..., 2]))
-    assert polar_deg.min() > 20 - 24 and np.median(polar_deg) == approx(45, abs=3)
-    # Three of four rigs have at least two lights a cluster, which are 6 sqrt(2) degrees apart on
-    # average, or closer where a turn about the axis moves them less.
-    assert (np.median(angles.min(axis=2), axis=1) < 12).mean() > 0.6

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from pytest import approx
 from scipy import stats
 from torch.testing import assert_close
 
@@ -15,7 +14,6 @@ from splinecli.workshop.synthesis.pixels import (
     PixelGenerator,
     PixelGeneratorConfig,
     draw_scene,
-    draw_shared_materials,
     draw_visible_normals,
 )
 
@@ -131,13 +129,3 @@ def test_pixels_of_a_capture_share_its_lights_and_its_exposure():
     brightest = exact.observations.unflatten(0, (16, 10)).amax(dim=(0, 2))
     assert (brightest > 0.15).all() and (brightest <= 1).all()
     assert draw(10, SHARED).captures == 1  # of fewer pixels than usual
-
-
-def test_a_capture_has_few_materials():
-    material = draw_shared_materials(64 * 2000, 2000, seeded(0))
-    base, roughness = (values.view(64, 2000).T for values in (material.base, material.roughness))
-    counts = np.array([len(values.unique()) for values in base])
-    assert counts.max() == 8
-    assert (counts == 1).mean() == approx(0.6, abs=4 * np.sqrt(0.24 / 2000))
-    one_gloss = np.array([len(values.unique()) == 1 for values in roughness])[counts > 1]
-    assert one_gloss.mean() == approx(0.5, abs=4 * np.sqrt(0.25 / len(one_gloss)))

@@ -117,9 +117,7 @@ def burley(surface, n, lights):
     "surface",
     [
         material(roughness=0.0),
-        material(roughness=1.0, base=0.9),
         material(specular=4.0, roughness=0.15),
-        material(metallic=0.3, specular=1.0, roughness=0.7),
         material(interface_loss=1.0, specular=0.5),
         material(minnaert=1.4, sheen=0.3),
         material(
@@ -128,7 +126,6 @@ def burley(surface, n, lights):
         material(metallic=1.0, roughness=0.6, second_share=0.3, second_roughness=0.2),
         material(specular=2.0, tail_exponent=1.5, second_share=0.7, second_roughness=0.8),
         material(retro=0.5),
-        material(clearcoat=1.0, clearcoat_gloss=0.0),
         material(clearcoat=0.6, clearcoat_gloss=0.9, specular=0.5, metallic=0.5, sheen=0.4),
     ],
 )
@@ -165,18 +162,8 @@ def test_drawn_materials_have_the_stated_classes():
         (metal, 0.28),
         (blend, 0.14),
         (values["specular"] > 1, 0.28 / 2),
-        ((values["sheen"] > 0)[~metal], 0.2),
-        (values["clearcoat"] > 0, 0.25),
-        (values["clearcoat"] > 1, 0.15),
         ((values["second_share"] > 0)[metal | blend], 0.4),
         ((values["second_share"] > 0)[~(metal | blend)], 0.15),
-        ((values["retro"] > 0)[~metal], 0.08),
-        (values["interface_loss"] > 0, 0.6),
-        (values["minnaert"] != 1, 0.7),
-        (values["tail_exponent"] < 2, 0.5),
-        # Half of what is no metal is log-uniform from 0.02, of which log10(2.5) / 1.7 lies under
-        # 0.05.
-        ((values["base"] < 0.05)[~metal], 0.5 * np.log10(0.05 / 10**-1.7) / 1.7),
     ):
         # four standard deviations
         assert flags.mean() == approx(share, abs=4 * np.sqrt(0.25 / len(flags)))

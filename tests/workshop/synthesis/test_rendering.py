@@ -17,7 +17,6 @@ pytest.importorskip("embreex")
 from numpy.testing import assert_allclose
 
 from distributions import seeded
-from point_lights import render_point_lights
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.workshop.synthesis import scenes as rendering
 from splinecli.workshop.synthesis.meshes import Mesh
@@ -186,26 +185,6 @@ def test_a_wall_casts_its_shadow():
     # Behind the wall, it is the other way round.
     behind = (x > 0.2 + 0.04) & (x < 0.6 - 0.04)
     assert np.abs(direct[behind, 1]).max() == 0
-
-
-def test_a_point_of_light_follows_lamberts_law_and_the_wall_throws_its_shadow():
-    """The cosine is h / d and the falloff (d0 / d)^2, so the radiance is albedo h d0^2 / d^3."""
-    tracer = Tracer(floor_with_wall())
-    visible = find_visible_surface(tracer, 50, 1)
-    lamps = vectors("-2 0.3 1; -0.8 1.2 3; 1.5 -0.4 0.9")
-    found = render_point_lights(tracer, visible, lamps, matte(0.7), np.zeros(4, np.int64))[
-        "matte"
-    ].numpy()
-    points = visible.samples.position
-    distance = np.linalg.norm(lamps - points[:, None], axis=2)
-    expected = 0.7 * lamps[:, 2] * np.linalg.norm(lamps, axis=1) ** 2 / distance**3
-    # of the ray to the lamp, where it passes x = 0.2
-    share = (0.2 - points[:, :1]) / (lamps[:, 0] - points[:, :1])
-    clear = ~((share > 0) & (share * lamps[:, 2] < 0.4))
-    # the wall ends at 1
-    sure = (np.abs(share * lamps[:, 2] - 0.4) > 0.02) & (np.abs(points[:, 1:2]) < 0.8)
-    assert_allclose(found[sure], (expected * clear)[sure], rtol=1e-5)
-    assert 0.1 < clear[sure].mean() < 0.95
 
 
 @parametrize("bounces", [1, 4])

@@ -1,6 +1,4 @@
-"""Procedural shapes: sound surfaces, true normals, hollows, fields against closed forms; meshes as
-files give them.
-"""
+"""Procedural shapes: sound surfaces, true normals and hollows; meshes as files give them."""
 
 import time
 import zipfile
@@ -8,7 +6,7 @@ import zipfile
 import numpy as np
 import pytest
 from numpy.random import default_rng
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from pytest import approx
 
 from scenes import assert_unit, parametrize, put, refuses, to_uint16, write_image
@@ -18,7 +16,6 @@ from splinecli.workshop.synthesis import meshes
 from splinecli.workshop.synthesis.meshes import (
     REACH,
     Mesh,
-    fit_to_frame,
     read_mesh,
     split_long_edges,
 )
@@ -33,44 +30,6 @@ from splinecli.workshop.synthesis.shapes import (
 pytest.importorskip("skimage")
 
 
-def points(count=2000, seed=0):
-    return default_rng(seed).uniform(-1, 1, (count, 3)).astype(np.float32)
-
-
-@parametrize(
-    "field",
-    [
-        meshes.ellipsoid(np.full(3, 0.5, np.float32)),
-        meshes.box(np.array((0.5, 0.3, 0.7), np.float32), 0.1),
-        meshes.torus(0.5, 0.2),
-        meshes.capsule(0.4, 0.2),
-    ],
-)
-def test_solids_are_true_distances(field):
-    at = points()
-    slope = np.linalg.norm(meshes.gradient(field, at), axis=1)
-    # But on the creases of the box's inside and on axes, which few points are near, distance grows
-    # at unit rate.
-    assert np.abs(slope - 1).mean() < 0.01
-    # And a step along it by the distance meets the surface.
-    foot = at - field(at)[:, None] * meshes.gradient(field, at)
-    outside = field(at) > 0.01
-    assert np.abs(field(foot))[outside].max() < 2e-3
-
-
-def test_a_smooth_union_fills_the_seam_and_a_cut_takes_out():
-    first, second = points(seed=1)[:, 0], points(seed=2)[:, 0]
-    union = meshes.smooth_union(first, second, 0.1)
-    apart = np.abs(first - second) > 0.1
-    assert_array_equal(union[apart], np.minimum(first, second)[apart])
-    below = np.minimum(first, second) - union
-    assert below.min() >= -1e-7
-    # a quarter of the blend, where both are alike
-    assert below.max() == approx(0.025, abs=1e-3)
-    cut, apart = meshes.smooth_cut(first, second, 0.1), np.abs(first + second) > 0.1
-    assert_allclose(cut[apart], np.maximum(first, -second)[apart])
-
-
 def test_triangles_lie_on_the_zero_with_the_field_s_normals():
     mesh = meshes.triangulate(meshes.torus(0.6, 0.25), (1.0, 1.0, 0.5), 0.03)
     assert np.abs(meshes.torus(0.6, 0.25)(mesh.vertices)).max() < 2e-4
@@ -80,17 +39,6 @@ def test_triangles_lie_on_the_zero_with_the_field_s_normals():
     assert (expected * mesh.vertex_normals).sum(axis=1).min() > 0.9999
     # Anticlockwise from outside, closed, and of the volume 2 pi^2 R r^2.
     assert outward_volume(mesh) == approx(2 * np.pi**2 * 0.6 * 0.25**2, rel=0.01)
-
-
-def test_crumbs_and_the_empty_field_are_dropped():
-    def two_balls(at):
-        large = np.linalg.norm(at, axis=1) - np.float32(0.5)
-        small = np.linalg.norm(at - np.float32(0.8), axis=1) - np.float32(0.1)
-        return np.minimum(large, small)
-
-    mesh = meshes.triangulate(two_balls, (1.0, 1.0, 1.0), 0.04)
-    assert np.linalg.norm(mesh.vertices, axis=1).max() < 0.51
-    assert meshes.triangulate(lambda at: np.ones(len(at), np.float32), (1.0, 1.0, 1.0), 0.1) is None
 
 
 def test_skipping_what_is_far_from_the_surface_changes_nothing(monkeypatch, rng):
@@ -208,15 +156,6 @@ def test_a_ball_is_read_from_every_format_smooth_and_in_the_frame(tmp_path, endi
     assert (outward * mesh.vertex_normals).sum(axis=1).min() > 0.999
     edges = mesh.vertices[mesh.faces] - mesh.vertices[np.roll(mesh.faces, 1, axis=1)]
     assert np.linalg.norm(edges, axis=2).max() <= 0.03
-
-
-def test_the_wider_side_fits_and_the_shape_is_kept():
-    box = trimesh.creation.box((4.0, 1.0, 2.0))
-    vertices = np.float32(box.vertices) + np.float32(3)
-    mesh = fit_to_frame(Mesh(vertices, box.faces.astype(np.int32), np.float32(box.vertex_normals)))
-    extent = np.ptp(mesh.vertices, axis=0)
-    assert_allclose(extent, 2 * REACH * np.array((1, 0.25, 0.5)), rtol=1e-5)
-    assert_allclose(mesh.vertices.min(axis=0), -mesh.vertices.max(axis=0), atol=1e-6)
 
 
 def test_a_mesh_far_from_the_origin_keeps_its_place(tmp_path):

@@ -49,15 +49,6 @@ def scene(pixels=300, lights=8):
     return torch.rand(pixels, lights, generator=generator), directions
 
 
-def test_a_flawless_capture_is_the_radiance_at_one_exposure():
-    radiance, directions = scene()
-    observations, calibrated, *_ = photograph_scene(radiance, directions, FLAWLESS, seeded(0))
-    exposure = (observations / radiance)[radiance < 0.9].unique()
-    assert 10**-0.7 / 1.01 < exposure.mean() < 1 / 0.99
-    assert_close(exposure, exposure[0].expand(len(exposure)))
-    assert_close(calibrated, directions)
-
-
 def test_ambient_light_is_the_same_in_all_images_of_a_capture():
     """It is between a share of the pixel's mean and of the capture's mean."""
     radiance, directions = scene()

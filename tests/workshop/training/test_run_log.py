@@ -1,15 +1,12 @@
-"""The log files of a run: metrics.csv, the figures and TensorBoard's events."""
+"""The log files of a run: metrics.csv and TensorBoard's events."""
 
 import csv
 from dataclasses import fields, replace
 
 import pytest
-import torch
 
-from scenes import decode_rgb, names_in, parametrize
-from splinecli.records.output_files import CURVES, TRAINING_MAPS
+from scenes import parametrize
 from splinecli.workshop.training import EVENTS, METRICS
-from splinecli.workshop.training.loop import Trainer
 from splinecli.workshop.training.run_files import Metrics, RunLog, read_metrics
 
 ROWS = [
@@ -51,20 +48,6 @@ def test_a_last_line_that_no_parser_likes_is_dropped(tmp_path, step):
         file.write(f"{step},1" + ",1.0" * 9 + "\n")
     assert RunLog(tmp_path, 100).set_aside is None
     assert read_metrics(tmp_path / METRICS) == ROWS[:2]
-
-
-def test_pictures_of_a_run(tiny, tmp_path):
-    Trainer(replace(tiny, steps=2), tmp_path, torch.device("cpu")).run()
-    assert names_in(tmp_path) == {
-        "checkpoint.safetensors",
-        "config.json",
-        CURVES,
-        TRAINING_MAPS,
-        METRICS,
-        "weights.safetensors",
-    }
-    assert decode_rgb((tmp_path / CURVES).read_bytes()).std() > 5
-    assert decode_rgb((tmp_path / TRAINING_MAPS).read_bytes()).std() > 20
 
 
 def test_tensorboard_s_events(tmp_path):
