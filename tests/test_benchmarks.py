@@ -1,8 +1,10 @@
 """Benchmarks run to their end on small inputs and print every row."""
 
 import importlib
+import math
 import re
 import shutil
+import time
 from pathlib import Path
 
 import numpy as np
@@ -119,6 +121,27 @@ def test_large_captures(run, tmp_path):
     assert numbers(row)[0] == approx(0.001, abs=2e-4)
     assert row.endswith("exact")
     assert plot.stat().st_size > 1000
+
+
+def test_gpu_session(tmp_path):
+    """A step that fails, or has no time left, is reported, and the others go on."""
+    module = importlib.import_module("gpu_session")
+    session = module.Session(tmp_path, tmp_path, time.time() + 60)
+    normals = np.broadcast_to((0.0, 0.6, 0.8), (2, 2, 3))
+    np.save(tmp_path / "one.npy", normals)
+    np.save(tmp_path / "other.npy", normals[..., [0, 2, 1]])
+    one, other = str(tmp_path / "one.npy"), str(tmp_path / "other.npy")
+    found = session.step("apart", module.normals_apart, one, other, seconds=60)
+    turned = math.degrees(math.asin(0.8) - math.asin(0.6))
+    assert (found["mean_deg"], found["max_deg"]) == approx((turned, turned))
+    assert session.step("missing", module.normals_apart, one, f"{other}.gz", seconds=60) is None
+    session.ends = time.time()
+    assert session.step("late", module.normals_apart, one, other, seconds=60) is None
+    report = (tmp_path / "report.txt").read_text()
+    assert report.count("FAILED") >= 2 and "FileNotFoundError" in report
+    assert "there is no time left" in report
+    steps = [entry["step"] for entry in read_json(tmp_path / "report.json")]
+    assert steps == ["apart", "missing", "late"]
 
 
 def test_all_figures(run, tmp_path):
