@@ -95,5 +95,5 @@ def check_one_of(kind: str, value: str, allowed: Collection[str]) -> None:
 
 def did_you_mean(value: object, names: Collection[str]) -> str | None:
     """Return the hint "Did you mean NAME?" if a name is similar to the value."""
-    found = get_close_matches(str(value).lower(), names, 1, cutoff=0.7)
+    found = get_close_matches(str(value).lower(), names, 1, cutoff=0.6)
     return f"Did you mean {found[0]}?" if found else None

@@ -204,6 +204,9 @@ with Messages(quiet=False).progress("cat", 25) as advance:
 def test_messages_name_what_was_meant(run, tmp_path):
     run("infer none --maps albedos", usage_error="Did you mean albedo?")
     run("infer none --maps reliefs", usage_error="Did you mean relief?")
+    run("infer none --light-frame xleft", usage_error="Did you mean x-left?")
+    run("infer none --first-light uper-left", usage_error="Did you mean upper-left?")
+    run("infer none --lights estimat", input_error="Did you mean estimate?")
     assert "waiting" not in run("watch nowhere", input_error="nowhere").err
     put(tmp_path / "a.txt", "no normals")
     run(f"integrate {tmp_path / 'a.txt'}", input_error="found neither .npy, .mat, PNG, TIFF,")

@@ -18,7 +18,7 @@ from splinecli.capture.formats.numbers import (
     read_rows_of_words,
     to_number,
 )
-from splinecli.errors import InputError, UsageError
+from splinecli.errors import InputError, UsageError, did_you_mean
 from splinecli.maths import Bools, Float64Array
 
 AXIS_WORDS = {
@@ -108,7 +108,8 @@ def parse_light_frame(text: str | None) -> LightFrame:
         if word not in AXIS_WORDS:
             words = ", ".join((*AXIS_WORDS, EXCHANGED))
             raise UsageError(
-                f"--light-frame is {text!r}, expected one or more of {words}, separated by commas"
+                f"--light-frame is {text!r}; expected one or more of {words}, separated by commas",
+                hint=did_you_mean(word, (*AXIS_WORDS, EXCHANGED)),
             )
         axis, sign = AXIS_WORDS[word]
         if axis in signs:

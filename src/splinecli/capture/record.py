@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from splinecli.capture.near_lamps import NearLamps
-from splinecli.errors import InputError, UsageError
+from splinecli.errors import InputError, UsageError, did_you_mean
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Integers
 from splinecli.maths.pixel_grid import ray_basis
 from splinecli.maths.robust import MIN_LIGHTS
@@ -52,7 +52,8 @@ def azimuth_of(first_light: str) -> float:
     if not abs(azimuth) <= 360:
         raise UsageError(
             f"found {first_light!r} as the side of the first light, expected one of"
-            f" {', '.join(SIDES_DEG)}, or its azimuth in degrees, counter-clockwise from the right"
+            f" {', '.join(SIDES_DEG)}, or its azimuth in degrees, counter-clockwise from the right",
+            hint=did_you_mean(first_light, SIDES_DEG),
         )
     return azimuth
 

@@ -111,7 +111,7 @@ def _unknown_name(error: Any) -> str | None:
     if option in RENAMED:
         return f"{option} is now {RENAMED[option]}."
     if option and hasattr(error, "possibilities"):
-        return f"no option {option}.{suggestion(sorted(error.possibilities or ()))}"
+        return f"no option {option}.{suggestion((error.possibilities or [])[:1])}"
     command = re.match(r"No such command ('.*?')\.?(?: Did you mean (.*?))?\??$", text)
     return (
         f"no command {command[1]}.{suggestion((command[2] or '').strip('?').split(', '))}"

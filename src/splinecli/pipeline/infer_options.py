@@ -377,7 +377,8 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
             *(self.mask, self.crosstalk, self.ground_truth, self.ambient),
         ):
             if name is not None:
-                check_file(Path(name), "a file", pipe=name == self.light_file)
+                words = (ESTIMATE, EQUAL)  # in place of some of the files
+                check_file(Path(name), "a file", pipe=name == self.light_file, words=words)
         self.radiometric_calibration()
 
     def radiometric_calibration(self) -> RadiometricCalibration:

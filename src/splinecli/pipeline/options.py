@@ -13,7 +13,7 @@ from typing import Annotated
 from msgspec import NODEFAULT, Meta
 
 from splinecli.capture.record import ESTIMATE
-from splinecli.errors import UsageError
+from splinecli.errors import UsageError, did_you_mean
 from splinecli.estimate.methods import (
     DEFAULT_METHOD,
     METHODS,
@@ -154,7 +154,7 @@ def parse_level(text: str) -> tuple[tuple[int, int], ...]:
             return points
     raise UsageError(
         f'--level is {text!r}; expected plane, or at least three points "X,Y X,Y X,Y"',
-        hint="Put quotation marks around the points",
+        hint=did_you_mean(text, ("plane",)) or "Put quotation marks around the points",
     )
 
 

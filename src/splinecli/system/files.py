@@ -9,14 +9,14 @@ import os
 import secrets
 import stat
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
 from msgspec import ValidationError, convert
 
-from splinecli.errors import InputError, OutputError
+from splinecli.errors import InputError, OutputError, did_you_mean
 
 UNFINISHED = ".splinecli-unfinished"  # suffix of hidden files that are being written
 _MOST_JSON = 1 << 24  # size limit of JSON files in bytes
@@ -283,14 +283,17 @@ def find_mode(path: Path) -> int | None:
         raise _unreadable(path, "a zero byte in its name") from None
 
 
-def check_file(path: Path, expected: str, *, pipe: bool = False) -> None:
+def check_file(
+    path: Path, expected: str, *, pipe: bool = False, words: Collection[str] = ()
+) -> None:
     """Raise InputError unless the path is a file. A device, for example, might never end.
 
     With `pipe`, process substitution of the shell, `<(...)`, is also accepted; see is_substitution.
+    `words` are those that an option accepts instead of a file, for the hint.
     """
     mode = find_mode(path)
     if mode is None:
-        raise InputError("the file does not exist", path)
+        raise InputError("the file does not exist", path, hint=did_you_mean(path, words))
     if not (stat.S_ISREG(mode) or (pipe and is_substitution(path))):
         raise InputError(
             f"found {_KINDS.get(stat.S_IFMT(mode), 'a device')}, expected {expected}", path
