@@ -176,6 +176,8 @@ def _estimate(
     return normals, errors, judged
 
 
+# Indirect light is found from the normals of every fourth pixel, if these are not too few
+_GATHER_STEP, _FEWEST_GATHERED = 4, 10_000
 # The most numbers, observations and directions, that an estimator gets at once
 _TILE_VALUES = 1 << 24
 
@@ -219,7 +221,15 @@ def estimate_pixels(
     normals = np.empty((n_pixels, 3), np.float32)
     errors = np.empty((n_pixels, 2), np.float32) if estimator.has_confidence else None
 
-    def estimate(pixels: PixelIndices, light: PixelLighting, progress: Progress = ignore) -> None:
+    def estimate(
+        estimator: Estimator,
+        pixels: PixelIndices,
+        lighting_at: LightingAt,
+        progress: Progress = ignore,
+    ) -> None:
+        if not len(pixels):
+            return
+        light = lighting_at(pixels)
         found, of_pixels = estimator.estimate_with_error(
             light.observations, light.directions, progress=progress
         )
@@ -234,22 +244,29 @@ def estimate_pixels(
     tile_pixels = min(
         estimator.tile_pixels, max(TILE_PIXELS, _TILE_VALUES // (each * observations.shape[1]))
     )
-    estimator = estimator.bind(lighting_at, mask)
-    for pixels in parts_of_pixels(n_pixels, tile_pixels):
-        estimate(pixels, lighting_at(pixels), progress)
+    bound = estimator.bind(lighting_at, mask)
     if refiner is None or errors is None:
+        for pixels in parts_of_pixels(n_pixels, tile_pixels):
+            estimate(bound, pixels, lighting_at, progress)
         return PixelEstimates(normals, errors, lighting_at)
+    step = max(1, min(_GATHER_STEP, n_pixels // _FEWEST_GATHERED))
+    for pixels in parts_of_pixels(n_pixels, tile_pixels, step=step):
+        estimate(bound, pixels, lighting_at, progress)
     advance = clock.begin("indirect_light", n_pixels, "removing indirect light")
-    indirect = lighting.find_indirect_light(mask, observations, lighting_at, normals)
+    direct = lighting_at
+    indirect = lighting.find_indirect_light(mask, observations, direct, normals, known=step)
     if indirect is not None:
         lighting_at = partial(lighting_without, indirect)
         # The other pixels keep their first estimates: estimating all again gained 0.02 degrees.
-        estimator = estimator.rebind(lighting_at, mask)
-        for pixels in parts_of_pixels(n_pixels, tile_pixels):
-            changed = pixels[indirect.counts_at(observations[pixels], pixels)]
-            if len(changed):
-                estimate(changed, lighting_at(changed))
-            advance(len(pixels))
+        without = estimator.rebind(lighting_at, mask)
+    for pixels in parts_of_pixels(n_pixels, tile_pixels):
+        left = pixels % step > 0
+        if indirect is not None:
+            changed = indirect.counts_at(observations[pixels], pixels)
+            estimate(without, pixels[changed], lighting_at)
+            left &= ~changed
+        estimate(bound, pixels[left], direct, progress)
+        advance(len(pixels))
     return PixelEstimates(normals, errors, lighting_at)
 
 

@@ -30,6 +30,7 @@ from splinecli.system.machine import in_order, one_thread_each
 
 _GRID_PIXELS, _MOST_LIGHTS = 500, 30
 _STEPS, _STEP, _OWN_STEP = 14, 0.06, 0.01  # of the common matrix, and of each light
+_MOMENTUM, _SQUARES = 0.7, 0.9  # decay of the means of the gradient and of its square in Adam
 # for checking given lights
 _FEW_PIXELS, _FEW_STEPS, _DOUBT_DEG = 250, 8, 10.0
 # The check stops if the cost falls by less in the first half of the steps, as with correct lights
@@ -255,7 +256,7 @@ def _follow(
     sizes = {common: _STEP, own: _OWN_STEP}
     if not intensities_known:
         sizes[own_logs] = 2 * _OWN_STEP
-    descent = torch.optim.Adam([{"params": [each]} for each in sizes], betas=(0.7, 0.9))
+    means = {each: (torch.zeros_like(each), torch.zeros_like(each)) for each in sizes}
     best, least = _Followed(start, 0.0, 1.0), np.inf
     for number in range(steps + 1):
         vectors = began @ (torch.eye(3) + common) + own
@@ -283,9 +284,14 @@ def _follow(
             break
         if number < steps:
             share = 0.53 + 0.5 * np.cos(np.pi * number / (steps + 1))
-            for group, step in zip(descent.param_groups, sizes.values(), strict=True):
-                group["lr"] = step * share
-            descent.zero_grad()
-            cost.backward()  # type: ignore[no-untyped-call]
-            descent.step()
+            # torch.optim takes a second to import
+            gradients = torch.autograd.grad(cost, [*sizes])
+            with torch.no_grad():
+                for (each, size), gradient in zip(sizes.items(), gradients, strict=True):
+                    mean, square = means[each]
+                    mean.lerp_(gradient, 1 - _MOMENTUM)
+                    square.lerp_(gradient.square(), 1 - _SQUARES)
+                    typical = (square / (1 - _SQUARES ** (number + 1))).sqrt() + 1e-8
+                    rate = size * share / (1 - _MOMENTUM ** (number + 1))
+                    each.addcdiv_(mean, typical, value=-rate)
     return best

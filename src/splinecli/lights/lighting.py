@@ -186,7 +186,12 @@ _GATHERED = 500_000
 
 
 def find_indirect_light(
-    mask: Bools, observations: Float32Array, lighting_at: LightingAt, normals: Float32Array
+    mask: Bools,
+    observations: Float32Array,
+    lighting_at: LightingAt,
+    normals: Float32Array,
+    *,
+    known: int = 1,
 ) -> IndirectLight | None:
     """Return the indirect light of a capture, or None if attached shadows show none that can be
     removed.
@@ -194,10 +199,10 @@ def find_indirect_light(
     The camera is always treated as orthographic, because only nearby parts exchange much light. The
     mask (H, W) has P true pixels. The observations (P, F) are divided only by the light
     intensities; `lighting_at` also removes the attenuation of near lamps, and returns the light
-    directions. The normals (P, 3) are unit, in the capture's frame.
+    directions. The normals (P, 3) are unit, in the capture's frame; only every `known`-th is read.
     """
     pixels = PixelPlaces(mask)
-    step = max(1, len(normals) // _GATHERED)
+    step = known * max(1, len(normals) // (_GATHERED * known))
     parts = partial(parts_of_pixels, len(normals))
     some = partial(parts, step=step)
 
@@ -206,6 +211,12 @@ def find_indirect_light(
         cosines = _cosines(light, normals[rows]).clip(min=0)
         shaded = np.square(cosines).sum(axis=1).clip(min=1e-6)
         return np.asarray((light.observations * cosines).sum(axis=1) / shaded, np.float32)
+
+    def interpolated_albedo(rows: PixelIndices) -> Float32Array:
+        # neighbours are shaded alike, but may differ in colour
+        brightness = lighting_at(rows).observations.sum(axis=1)
+        shading = matte_albedo(rows[::known]) / brightness[::known].clip(min=1e-20)
+        return np.asarray(shading.repeat(known)[: len(rows)] * brightness, np.float32)
 
     albedo = np.concatenate([*side_by_side(matte_albedo, some())])
     total = float(albedo.sum(dtype=np.float64))
@@ -245,7 +256,7 @@ def find_indirect_light(
     # the camera does not show the reflecting surface.
     exposure = min(exposure, 1.4 / float(np.quantile(reflected, 0.98)))
     if step > 1:
-        albedo = np.concatenate([*side_by_side(matte_albedo, parts())])
+        albedo = np.concatenate([*side_by_side(interpolated_albedo, parts())])
     # The albedo of pixels at grazing angles to all lamps is arbitrary.
     return replace(indirect, albedo=(exposure * albedo).clip(max=10.0).astype(np.float16))
 
