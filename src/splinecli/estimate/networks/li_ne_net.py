@@ -44,7 +44,7 @@ class ResidualBlock(nn.Module):
 
 
 _SIDE = 4  # patches along a side of the maps for which winograd_conv is written
-_AT_ONCE = 256  # maps whose features stay in a processor's cache
+AT_ONCE = 256  # pixels whose features stay in a processor's cache
 
 
 def _in_both_directions(transform: tuple[tuple[float, ...], ...]) -> Tensor:
@@ -114,7 +114,10 @@ class MapEncoder(nn.Module):
         if maps.shape[-1] == _SIDE * PATCH and not torch.is_grad_enabled() and is_float32(maps):
             return self._few_products(maps)
         patches = pixel_unshuffle(maps, PATCH).contiguous(memory_format=torch.channels_last)
-        features: Tensor = self.blocks(self.patches(patches) + self.position)
+        entered: Tensor = self.patches(patches)
+        # In training, the sums over the blocks stay in float32.
+        kind = self.position.dtype if torch.is_grad_enabled() else entered.dtype
+        features: Tensor = self.blocks(entered + self.position.to(kind))
         return features
 
     def _few_products(self, maps: Tensor) -> Tensor:
@@ -125,7 +128,7 @@ class MapEncoder(nn.Module):
         layers = [(winograd_weights(layer.weight), layer.bias) for layer in convolutions]
         position = self.position.flatten(2).permute(2, 0, 1)
         found = maps.new_empty(len(maps), _SIDE**2, self.position.shape[1])
-        for part in slices(len(maps), _AT_ONCE):
+        for part in slices(len(maps), AT_ONCE):
             # (P, C, rows, y, columns, x) to (rows, columns, P, C, y, x)
             split = maps[part].view(-1, maps.shape[1], _SIDE, PATCH, _SIDE, PATCH)
             patches = split.permute(2, 4, 0, 1, 3, 5).reshape(

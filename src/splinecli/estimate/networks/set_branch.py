@@ -17,8 +17,9 @@ from torch.nn.functional import normalize, scaled_dot_product_attention
 
 from splinecli.estimate.fits.least_squares import direction_products, weighted_sum
 from splinecli.estimate.networks.config import HEAD_WIDTH
-from splinecli.estimate.networks.li_ne_net import zeroed
+from splinecli.estimate.networks.li_ne_net import AT_ONCE, zeroed
 from splinecli.maths import Floats
+from splinecli.maths.pixel_grid import slices
 from splinecli.maths.robust import inverse_3x3, lit_values, multiply_symmetric
 
 SAMPLE = 512  # number of pixels of a capture that all its pixels attend to
@@ -197,7 +198,10 @@ class SetBranch(nn.Module):
             if self.contexts is not None:
                 known = None if context is None else context.layers[number]
                 pixel, summary = self.contexts[number](tokens[:, 0], level, captures, known)
-                tokens = torch.cat((pixel[:, None].to(tokens), tokens[:, 1:]), dim=1)
+                if torch.is_grad_enabled():
+                    tokens = torch.cat((pixel[:, None].to(tokens), tokens[:, 1:]), dim=1)
+                else:
+                    tokens[:, 0] = pixel
                 found.append(summary)
         tokens = self.norm(tokens)
         with torch.autocast(observed.device.type, enabled=False):
@@ -233,16 +237,41 @@ class AttentionLayer(nn.Module):
         split = self.queries_keys_values(self.norm1(tokens)).view(
             pixels, count, 3, self.heads, HEAD_WIDTH
         )
-        queries, keys, values = split.permute(2, 0, 3, 1, 4)
-        if queries.device.type == "cpu" and queries.dtype == torch.bfloat16:
-            # On a CPU, PyTorch's attention is slower in bfloat16 than in float32, its gradient up
-            # to six times.
-            queries, keys, values = queries.float(), keys.float(), values.float()
+        few = mask is None and count <= _FEW_TOKENS and split.device.type == "cpu"
         with torch.autocast(tokens.device.type, enabled=False):
-            attended = scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
+            if few and not torch.is_grad_enabled():
+                attended = _among_few(split)
+            else:
+                queries, keys, values = split.permute(2, 0, 3, 1, 4)
+                if queries.device.type == "cpu" and queries.dtype == torch.bfloat16:
+                    # On a CPU, PyTorch's attention is slower in bfloat16 than in float32, its
+                    # gradient up to six times.
+                    queries, keys, values = queries.float(), keys.float(), values.float()
+                attended = scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
         tokens = tokens + self.attended(attended.transpose(1, 2).reshape(pixels, count, width))
         out: Tensor = tokens + self.perceptron(self.norm2(tokens))
         return out
+
+
+# With more tokens, PyTorch's attention is faster on a CPU than products of small matrices
+_FEW_TOKENS = 24
+
+
+def _among_few(split: Tensor) -> Tensor:
+    """Return the attention (P, heads, T, C) among the tokens of each pixel, from their queries,
+    keys and values (P, T, 3, heads, C).
+    """
+    _, count, _, heads, width = split.shape
+    found = split.new_empty(len(split), heads, count, width, dtype=torch.float32)
+    for part in slices(len(split), AT_ONCE):
+        queries, keys, values = split[part].float().permute(2, 0, 3, 1, 4).flatten(1, 2)
+        weights = torch.baddbmm(
+            queries.new_zeros(1, 1, 1), queries, keys.mT, beta=0, alpha=width**-0.5
+        )
+        weights.clamp_(-80, 80).exp_()  # their sum is finite
+        total = weights.view(-1, count) @ weights.new_ones(count, 1)
+        found[part] = (weights @ values).div_(total.view(-1, count, 1)).view(found[part].shape)
+    return found
 
 
 def _weighted_normals(targets: Tensor, lights: Tensor, weight: Tensor) -> Tensor:
