@@ -47,44 +47,44 @@ _SIDE = 4  # patches along a side of the maps for which winograd_conv is written
 AT_ONCE = 256  # pixels whose features stay in a processor's cache
 
 
-def _in_both_directions(transform: tuple[tuple[float, ...], ...]) -> Tensor:
-    matrix = torch.tensor(transform, dtype=torch.float32)
-    return torch.kron(matrix, matrix)
-
-
 # The transforms F(4, 3) of values, weights and products (Lavin and Gray, Fast algorithms for
 # convolutional neural networks, CVPR 2016, equation 13). The first and the last of six values are
 # padding: their columns are left out.
-_OF_VALUES = _in_both_directions(
-    ((0, -5, 0, 1), (-4, -4, 1, 1), (4, -4, -1, 1), (-2, -1, 2, 1), (2, -1, -2, 1), (4, 0, -5, 0))
+_OF_VALUES = torch.tensor(
+    ((0, -5, 0, 1), (-4, -4, 1, 1), (4, -4, -1, 1), (-2, -1, 2, 1), (2, -1, -2, 1), (4, 0, -5, 0)),
+    dtype=torch.float32,
 )
 _OF_WEIGHTS = (
-    _in_both_directions(((6, 0, 0), (-4, -4, -4), (-4, 4, -4), (1, 2, 4), (1, -2, 4), (0, 0, 24)))
-    / 24**2
+    torch.tensor(((6, 0, 0), (-4, -4, -4), (-4, 4, -4), (1, 2, 4), (1, -2, 4), (0, 0, 24))) / 24
 )
-_OF_PRODUCTS = _in_both_directions(
-    ((1, 1, 1, 1, 1, 0), (0, 1, -1, 2, -2, 0), (0, 1, 1, 4, 4, 0), (0, 1, -1, 8, -8, 1))
+_OF_PRODUCTS = torch.tensor(
+    ((1, 1, 1, 1, 1, 0), (0, 1, -1, 2, -2, 0), (0, 1, 1, 4, 4, 0), (0, 1, -1, 8, -8, 1)),
+    dtype=torch.float32,
 )
+
+
+def _transformed(values: Tensor, transform: Tensor) -> Tensor:
+    """Return the transform (m, n) of values (n * n, ...) in both directions: (m * m, ...)."""
+    m, n = transform.shape
+    rows = (transform @ values.reshape(n, -1)).view(m, n, -1)
+    return torch.bmm(transform.expand(m, m, n), rows).view(m * m, *values.shape[1:])
 
 
 def winograd_weights(weight: Tensor) -> Tensor:
     """Return the transformed weights (36, C, D) of a convolution (D, C, 3, 3)."""
-    return (_OF_WEIGHTS @ weight.permute(2, 3, 1, 0).reshape(9, -1)).view(-1, *weight.shape[1::-1])
+    return _transformed(weight.permute(2, 3, 1, 0).flatten(0, 1), _OF_WEIGHTS)
 
 
 def winograd_conv(x: Tensor, transformed: Tensor, bias: Tensor | None) -> Tensor:
     """Convolve maps (16, P, C) of 4 x 4 positions with `winograd_weights`, padded with zeros:
     (16, P, D).
 
-    It takes 36 products for the 144 of a convolution, and each transform is one product of
-    matrices.
+    It takes 36 products for the 144 of a convolution.
     """
-    _, n_maps, width = x.shape
-    values = (_OF_VALUES @ x.view(_SIDE**2, -1)).view(-1, n_maps, width)
-    products = torch.bmm(values, transformed)
+    products = torch.bmm(_transformed(x, _OF_VALUES), transformed)
     if bias is not None:
         products[7] += bias  # the transform adds this product to all positions, with a factor of 1
-    return (_OF_PRODUCTS @ products.view(len(products), -1)).view(_SIDE**2, n_maps, -1)
+    return _transformed(products, _OF_PRODUCTS)
 
 
 def is_float32(values: Tensor) -> bool:
