@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_erosion, gaussian_filter
-from scipy.spatial.transform import Rotation
 
 from splinecli.lights.outline import DARK_SHARE
 from splinecli.maths import Bools, Float64Array, Floats
@@ -33,6 +31,8 @@ def normal_derivatives(normals: Floats, mask: Bools, *, most: int) -> Float64Arr
     At most `most` pixels are returned, all with neighbours, or None if there are fewer than 50. The
     normals (H, W, 3) in a mask (H, W) may have any length.
     """
+    from scipy.ndimage import binary_erosion, gaussian_filter
+
     inside = binary_erosion(mask)
     if np.count_nonzero(inside) < 50 or min(mask.shape) < 2:
         return None
@@ -130,6 +130,8 @@ def lights_of_least_curl(
     # the smallest standard deviation assumed for known intensities
     spread = max(0.02, 1.5 * images.unit_residual) if intensities_known else _INTENSITY_SPREAD
     guess_deg = np.asarray(errors_deg)
+
+    from scipy.spatial.transform import Rotation
 
     def costs(matrices: Float64Array) -> Float64Array:
         lights = factors @ matrices

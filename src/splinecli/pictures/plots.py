@@ -274,21 +274,22 @@ def method_maps(
     return png_bytes(figure, _MAPS_DPI)
 
 
-def _draw_bar(
-    figure: Figure, left: int, bottom: int, height: int, text: int, *, side: int = -1
-) -> None:
-    """Draw a vertical colour bar of errors, `text` pixels wide, with labels and title on one
-    side.
+def _draw_bar(figure: Figure, left: int, bottom: int, height: int, text: int) -> None:
+    """Draw a vertical colour bar of errors, `text` pixels wide, with labels and title on its
+    left.
     """
     inset = text // 2  # room for half a label at either end
-    length, edge = height - 2 * inset, left + text * (side > 0)
-    column = np.linspace(0, TOP_DEG, length)[:, None].repeat(text, axis=1)
-    figure.figimage(colour_errors(column), left, bottom + inset, origin="lower")
+    column = _bar(height - 2 * inset, text)
+    figure.figimage(column, left, bottom + inset)
     for value, label in TICKS.items():
-        y = bottom + inset + value / TOP_DEG * (length - 1)
-        _write(figure, edge + side * 0.4 * text, y, label, text, ha="left" if side > 0 else "right")
+        y = bottom + inset + value / TOP_DEG * (len(column) - 1)
+        _write(figure, left - 0.4 * text, y, label, text, ha="right")
     size = _text_height(height, [TITLE], most=text)
-    _write(figure, edge + side * 3 * text, bottom + height / 2, TITLE, size, rotation=90)
+    _write(figure, left - 3 * text, bottom + height / 2, TITLE, size, rotation=90)
+
+
+def _bar(height: int, width: int) -> Picture:
+    return colour_errors(np.linspace(TOP_DEG, 0, height)[:, None].repeat(width, axis=1))
 
 
 def error_map_picture(error_map_deg: Floats) -> Picture:
@@ -297,8 +298,8 @@ def error_map_picture(error_map_deg: Floats) -> Picture:
     A map of fewer than 256 rows is enlarged by an integer factor while its width stays within 1024
     pixels, then padded to 256 rows.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    # Loading matplotlib takes longer than everything else that is drawn for a capture.
+    from PIL import Image, ImageDraw, ImageFont
 
     picture = colour_errors(error_map_deg)
     height, width = picture.shape[:2]
@@ -309,12 +310,18 @@ def error_map_picture(error_map_deg: Floats) -> Picture:
     picture = np.pad(picture, margins, constant_values=255)
     height = len(picture)
     text = max(18, height // 22)
-    panel = Figure(figsize=(6 * text / _MAPS_DPI, height / _MAPS_DPI), dpi=_MAPS_DPI)
-    canvas = FigureCanvasAgg(panel)
-    _draw_bar(panel, text, text // 2, height - text, text, side=1)
-    canvas.draw()  # type: ignore[no-untyped-call]
-    drawn = np.asarray(canvas.buffer_rgba())[..., :3]  # type: ignore[no-untyped-call]
-    return np.hstack([picture, drawn])
+    bar = _bar(height - 2 * text, text)
+    panel = Image.new("RGB", (6 * text, height), "white")
+    panel.paste(Image.fromarray(bar), (text // 2, text))
+    draw, font = ImageDraw.Draw(panel), ImageFont.load_default(text)
+    for value, label in TICKS.items():
+        y = text + (1 - value / TOP_DEG) * (len(bar) - 1)
+        draw.text((1.9 * text, y), label, "black", font, anchor="lm")
+    title = Image.new("RGB", (height, 2 * text), "white")
+    font = ImageFont.load_default(_text_height(height, [TITLE], most=text))
+    ImageDraw.Draw(title).text((height / 2, text), TITLE, "black", font, anchor="mm")
+    panel.paste(title.rotate(90, expand=True), (round(3.7 * text), 0))
+    return np.hstack([picture, np.asarray(panel)])
 
 
 def calibration_picture(balls: Sequence[BallCalibration]) -> bytes:

@@ -32,6 +32,7 @@ from splinecli.maths.pixel_grid import focal_length, pixel_rays, ray_basis
 PixelNumbers = NDArray[np.int32]
 DISCONTINUITY = 2.0  # how easily the surface tears, as in the paper
 _MOST_STEPS = 5_000  # steps of conjugate gradients, as in the paper's code
+_FEW_PIXELS = 3_000  # solved directly, in less time than multigrid takes to import
 
 # The cosine between a normal and its ray at 87 degrees. Beyond this angle, one degree changes the
 # slope by a third or more, so the normal is not a reliable indication of the height. The heights of
@@ -147,7 +148,7 @@ class LaplacianSolver:
         accurate to seven digits.
         """
         from scipy.sparse import csr_matrix, diags_array
-        from scipy.sparse.linalg import cg
+        from scipy.sparse.linalg import cg, spsolve
 
         # Small costs on changes of the gaps and heights keep the system from being singular, so
         # pixels without equations keep their heights. The equations have costs up to 1.
@@ -163,6 +164,8 @@ class LaplacianSolver:
             inverse = diags_array(1 / np.maximum(diagonal, 1e-5))
             change, _ = cg(matrix, forces, rtol=0, atol=least, maxiter=_MOST_STEPS, M=inverse)
             return change
+        if self._n_pixels < _FEW_PIXELS:
+            return np.asarray(spsolve(matrix, forces))
         from pyamg import ruge_stuben_solver
 
         # For these matrices, classical multigrid is faster than smoothed aggregation, including its

@@ -237,16 +237,16 @@ class AttentionLayer(nn.Module):
         split = self.queries_keys_values(self.norm1(tokens)).view(
             pixels, count, 3, self.heads, HEAD_WIDTH
         )
+        if split.device.type == "cpu" and split.dtype == torch.bfloat16:
+            # On a CPU, PyTorch's attention is slower in bfloat16 than in float32, its gradient up
+            # to six times.
+            split = split.float()
         few = mask is None and count <= _FEW_TOKENS and split.device.type == "cpu"
         with torch.autocast(tokens.device.type, enabled=False):
             if few and not torch.is_grad_enabled():
                 attended = _among_few(split)
             else:
                 queries, keys, values = split.permute(2, 0, 3, 1, 4)
-                if queries.device.type == "cpu" and queries.dtype == torch.bfloat16:
-                    # On a CPU, PyTorch's attention is slower in bfloat16 than in float32, its
-                    # gradient up to six times.
-                    queries, keys, values = queries.float(), keys.float(), values.float()
                 attended = scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
         tokens = tokens + self.attended(attended.transpose(1, 2).reshape(pixels, count, width))
         out: Tensor = tokens + self.perceptron(self.norm2(tokens))
@@ -262,9 +262,9 @@ def _among_few(split: Tensor) -> Tensor:
     keys and values (P, T, 3, heads, C).
     """
     _, count, _, heads, width = split.shape
-    found = split.new_empty(len(split), heads, count, width, dtype=torch.float32)
+    found = split.new_empty(len(split), heads, count, width)
     for part in slices(len(split), AT_ONCE):
-        queries, keys, values = split[part].float().permute(2, 0, 3, 1, 4).flatten(1, 2)
+        queries, keys, values = split[part].permute(2, 0, 3, 1, 4).flatten(1, 2)
         weights = torch.baddbmm(
             queries.new_zeros(1, 1, 1), queries, keys.mT, beta=0, alpha=width**-0.5
         )
