@@ -31,9 +31,9 @@ class OutlineTurn(NamedTuple):
 
     def share(self, part: float) -> Float64Array:
         """Return the matrix (3, 3) of a fraction of the rotation, from 0 to 1."""
-        from scipy.spatial.transform import Rotation
+        import cv2
 
-        return np.asarray(Rotation.from_rotvec(part * self.rotation).as_matrix())
+        return np.asarray(cv2.Rodrigues(part * self.rotation)[0], np.float64)
 
 
 def turn_at_outline(
@@ -46,15 +46,15 @@ def turn_at_outline(
     intensities. The mask (H, W) has P true pixels, in row-major order, and the directions (F, 3)
     are unit.
     """
-    from scipy.spatial.transform import Rotation
+    import cv2  # scipy.spatial takes a third of a second to import
 
     normals, outwards = _rim(observations, mask, light_directions)
     if len(normals) < 20:  # too few lit pixels at the outline
         return None
     along = np.cross((0.0, 0.0, 1.0), outwards)
-    turn = Rotation.identity()
+    turn = np.eye(3)
     for _ in range(25):
-        turned = turn.apply(normals)
+        turned = normals @ turn.T
         # A small rotation w adds w x n. The first residual is along the view axis, the second along
         # the outline. Normals within a pixel of the outline have a z of about 0.25, because pixels
         # have an extent and masks end inside the object.
@@ -63,10 +63,11 @@ def turn_at_outline(
         weights = 1 / (np.abs(residuals) + 0.1)
         curvature = np.einsum("kp,kpi,kpj->ij", weights, slopes, slopes) + 1e-3 * np.eye(3)
         step = np.linalg.solve(curvature, -np.einsum("kp,kpi,kp->i", weights, slopes, residuals))
-        turn = Rotation.from_rotvec(step) * turn
+        turn = np.asarray(cv2.Rodrigues(step)[0]) @ turn
         if np.abs(step).max() < 1e-4:
             break
-    return OutlineTurn(np.asarray(turn.as_rotvec()), float(np.median(np.abs(residuals[0]))))
+    rotation = np.asarray(cv2.Rodrigues(turn)[0][:, 0], np.float64)
+    return OutlineTurn(rotation, float(np.median(np.abs(residuals[0]))))
 
 
 def is_outlined(mask: Bools) -> bool:
