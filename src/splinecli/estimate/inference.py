@@ -204,8 +204,8 @@ def estimate_pixels(
     progress: Progress = ignore,
     clock: Clock | None = None,
 ) -> PixelEstimates:
-    """Estimate the normals of a capture's pixels. Those that indirect light reaches are estimated
-    again without it.
+    """Estimate the normals of a capture's pixels. Where indirect light matters, it is removed
+    first.
 
     Only the networks with a refiner remove indirect light. The refinement net also learns from
     these estimates.
