@@ -268,6 +268,7 @@ def test_a_solid_in_the_files(run):
     import trimesh
 
     run("integrate normals.npy -o out --pixel-size 0.5 --solid 3 --format glb,ply,obj,stl,3mf")
+    assert read_json("out/surface.json")["solid_mm"] == 3
     with ZipFile("out/mesh.3mf") as package:
         model = ElementTree.fromstring(package.read("3D/3dmodel.model"))
     assert model.attrib["unit"] == "millimeter"
@@ -293,6 +294,7 @@ def test_a_solid_in_the_files(run):
         assert solid.volume == approx(volume, rel=0.01)
     says = "the surface has no scale", "--pixel-size"
     run("integrate normals.npy -o flat --solid 3", usage_error=says)
+    run("integrate normals.npy --solid 3 --format png", usage_error="--format names no mesh")
 
 
 def test_a_picture_of_the_depth(run):

@@ -249,8 +249,8 @@ def test_views_ambient_light_and_confidence(open_page, webgl):
         "view=shaded&specular=0": encode_srgb(cosine),
         "view=normals": np.rint(255 * (normals + 1) / 2) * mask[..., None],
         "view=specular&shininess=32": encode_srgb(0.4 * cosine + 0.7 * glossy(normals, light, 32)),
-        f"view=shaded&ambient={ambient}": encode_srgb((1 - ambient) * cosine + ambient * sky),
-        "confidence=1": encode_srgb(cosine),
+        f"specular=0&ambient={ambient}": encode_srgb((1 - ambient) * cosine + ambient * sky),
+        "confidence=1&specular=0": encode_srgb(cosine),
     }
     pictures = views(
         open_page, html, [f"light=0.8,-0.1&{choice}" for choice in expected], webgl=webgl

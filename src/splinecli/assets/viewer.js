@@ -132,7 +132,7 @@ function showSettings() {
   const view = views.find((input) => input.checked).value, row = (input) => input.parentElement;
   if (gain) row(gain).hidden = view !== "shaded";  // specular enhancement has fixed shares
   row(shininess).hidden = view === "normals" || (MATERIAL && view === "shaded");
-  for (const input of [exposure, softness, tint, ambient]) if (input) row(input).hidden = view === "normals";
+  for (const input of [exposure, softness, tint, ambient, coloured]) if (input) row(input).hidden = view === "normals";
   redraw();
 }
 
@@ -159,6 +159,12 @@ function writeAddress() {
  */
 function readAddress() {
   const wanted = new URLSearchParams(location.hash.slice(1)), numbers = (name) => wanted.get(name).split(",").map(Number);
+  for (const input of [...views, exposure, gain, softness, ambient, shininess, tint, coloured, doubt].filter(Boolean)) {
+    input.checked = input.defaultChecked;  // what the address leaves out is as on a new page
+    input.value = input.defaultValue;
+  }
+  show(1, 0, 0);
+  ends = null;
   for (const input of views) input.checked = input.value === wanted.get("view") || (input.checked && !wanted.has("view"));
   if (!views.some((input) => input.checked)) views[0].checked = true;
   for (const [name, input] of Object.entries({ exposure, specular: gain, softness, ambient }))
@@ -269,7 +275,6 @@ function start() {
   find("whole").addEventListener("click", () => show(1, 0, 0));
   addEventListener("hashchange", readAddress);
   new ResizeObserver(redraw).observe(surface);
-  show(1, 0, 0);
   readAddress();
 }
 

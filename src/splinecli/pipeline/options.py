@@ -270,6 +270,13 @@ class IntegrateOptions(Display, frozen=True, kw_only=True):
         if self.prior_detail is not None and self.prior is None:
             hint = "Add --prior, or leave --prior-detail out"
             raise UsageError("--prior-detail needs --prior", hint=hint)
+        of_mesh = {"--solid": self.solid, "--decimate": self.decimate}
+        given = [name for name, value in of_mesh.items() if value is not None]
+        if given and not any("mesh" in name for name in self.files):
+            raise UsageError(
+                f"{given[0]} changes the mesh, but --format names no mesh",
+                hint="Add glb, ply, obj, stl or 3mf",
+            )
         if self.decimate is not None and self.pixel_aspect != 1:
             raise UsageError(
                 "--decimate needs square pixels, so it cannot be used with --pixel-aspect",

@@ -178,6 +178,7 @@ class SurfaceReport(SurfaceFacts):
     prior: str | None
     level: LevelReport | None
     pixel_aspect: Positive
+    solid_mm: Positive | None  # the thickness of a closed mesh
     n_pixels: Natural
     image_size: ImageSize
     seconds: NotNegative
