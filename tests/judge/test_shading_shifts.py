@@ -1,11 +1,14 @@
 """Images of smooth objects that were moved by known amounts: each is found, and no other."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from scenes import parametrize, shade, sphere, spiral_lights, square_grid, tilted
 from splinecli.capture.sample import Sample
-from splinecli.judge.shading_shifts import moved_back, shading_shifts
+from splinecli.images.registration import shifts_of_shading
+from splinecli.judge.evidence import Evidence, ImageShift
 from splinecli.maths.normals import unit
 
 SIDE, N_LIGHTS = 56, 12
@@ -27,6 +30,10 @@ def images(shape, *, gloss=0.0, lights=LIGHTS):
 
 def sample_of(pictures, mask):
     return Sample(np.float32(pictures[mask]), mask, 1)
+
+
+def shading_shifts(sample, lights):
+    return shifts_of_shading(sample.images, sample.mask, lights)
 
 
 def moved(pictures, shifts):
@@ -72,9 +79,14 @@ def test_rough_lights_are_no_shift(rng):
 
 def test_what_is_moved_back_is_as_before():
     pictures, mask = images("ball")
-    known, values = moved_back(sample_of(moved(pictures, {2: (3, -1)}), mask), {2: (3, -1)})
-    assert 0.8 * mask.sum() < known.sum() < mask.sum()
-    assert values[known] == pytest.approx(pictures[mask][known], abs=1e-6)
+    sample = sample_of(moved(pictures, {2: (3, -1)}), mask)
+    names = [str(number) for number in range(N_LIGHTS)]
+    seen = Evidence(names, LIGHTS, range(N_LIGHTS), sample, sample, True)
+    assert seen.shifts == [ImageShift(2, 3, -1)]
+    back = seen.moved_back(seen.shifts).sample
+    assert 0.8 * mask.sum() < back.mask.sum() < mask.sum()
+    assert back.observations == pytest.approx(pictures[back.mask], abs=1e-6)
+    assert replace(seen, sample=replace(sample, step=4)).shifts == [ImageShift(2, 12, -4)]
 
 
 def test_too_little_is_not_judged():

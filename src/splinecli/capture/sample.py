@@ -7,7 +7,7 @@ import numpy as np
 
 from splinecli.errors import InputError
 from splinecli.images.mask import find_object
-from splinecli.maths import Bools, Floats
+from splinecli.maths import Bools, Float64Array, Floats
 
 MAX_PIXELS = 20_000  # larger captures are subsampled by a factor of 2, 3 and so on
 CLOSEUP_SIDE = 192  # side of a closeup in pixels
@@ -22,6 +22,13 @@ class Sample:
     observations: Floats
     mask: Bools  # (h, w) bool with p true pixels
     step: int  # distance between neighbouring pixels of the grid, in pixels of the images
+
+    @property
+    def images(self) -> Float64Array:
+        """The observations on maps (F, h, w), zero outside the mask."""
+        found = np.zeros((self.observations.shape[1], *self.mask.shape))
+        found[:, self.mask] = self.observations.T
+        return found
 
 
 def grid_of(mask: Bools) -> Part:

@@ -18,6 +18,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from splinecli.images.registration import ShiftedSums, are_still
 from splinecli.maths import Array, Bools, Float32Array, Float64Array, Floats
 from splinecli.maths.pixel_grid import slices
 from splinecli.maths.robust import inverse_3x3
@@ -38,13 +39,6 @@ LEAST_FIT, CLEAR_FIT, MOST_UNLIKE = 0.3, 0.8, 3.0
 and farther from 1 than the median correlation by the factor MOST_UNLIKE, because images with little
 detail fit badly, but alike. A median below LEAST_FIT leaves nothing to align by: it is 0.05 to 0.25
 on a real ball, and 0.44 to 0.95 on two statues."""
-
-EXPLAINED = 0.97
-"""If the correlation of every image with its prediction is at least this without any motion, only a
-motion that reduces the residuals by the factor _CLEARER is accepted. On a still ball with stripes,
-whose terminators a matte model without shadows does not explain, moving the images by a pixel
-reduces them by 1.5.
-"""
 
 LARGEST_MOTION = 0.35  # of a pixel, as a share of the object's longer side
 UNMOVED = 0.1  # pixels; a capture in which no image moved by more is left as it is
@@ -72,7 +66,6 @@ _SMALLEST_ENERGY, _CUT = (
 _DARK, _SHADOW_WEIGHT = 0.1, 0.05
 _STEPS, _TRIALS = 15, 4
 _SIMPLER = 1.06  # a model with more parameters must reduce the residuals by this factor
-_CLEARER = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +112,8 @@ def align_images(images: Float32Array, mask: Bools, lights: Float64Array | None)
         (n for n, (_, each) in enumerate(pyramid) if max(each.shape) <= _SIDE_OF_FIRST),
         len(pyramid) - 1,
     )
+    if are_still(images, mask, start.lights):
+        return _described("translation", unmoved, mask, np.ones(len(images)))
     start.transforms[:, :2, 2] = 2.0**number * _first_shifts(*pyramid[number], start.lights)
     prior = 0.1 if lights is not None else 1e-3
     # The model is chosen on a level of half the resolution, where all of them are quick.
@@ -129,11 +124,9 @@ def align_images(images: Float32Array, mask: Bools, lights: Float64Array | None)
         model: level.cost(level.data, level.lights, scale) for model, (level, _) in found.items()
     }
     still, _ = _solve(pyramid, first, _State(unmoved, start.lights), 0, prior)
-    fits = still.correlations()
-    factor = _CLEARER if fits.min() >= EXPLAINED else _SIMPLER
     least = min(costs["translation"], costs["similarity"])
-    if still.cost(still.data, still.lights, scale) <= factor * least:
-        return _described("translation", unmoved, mask, fits)
+    if still.cost(still.data, still.lights, scale) <= _SIMPLER * least:
+        return _described("translation", unmoved, mask, still.correlations())
     model: Model = "translation"
     for richer in ("similarity", "homography"):
         if costs[model] > _SIMPLER * costs[richer]:
@@ -291,13 +284,11 @@ def _first_shifts(images: Float32Array, mask: Bools, lights: Float64Array) -> Fl
     similar lights.
     """
     import cv2
-    from scipy.fft import irfft2, next_fast_len, rfft2
 
     count = len(images)
     reach = max(2, round(_REACH * min(int(np.ptp(places)) + 1 for places in np.nonzero(mask))))
     area = cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1))) > 0
-    shape = [next_fast_len(side + reach, real=True) for side in mask.shape]
-    spectra = []
+    sizes = []
     for image in images:
         # Sizes of gradients of logarithms: a contour looks alike under similar lights, and paint
         # under all.
@@ -305,15 +296,15 @@ def _first_shifts(images: Float32Array, mask: Bools, lights: Float64Array) -> Fl
         size = np.hypot(down, right)
         size = np.minimum(size, np.quantile(size[area], 0.95))
         size = np.where(area, size - cv2.GaussianBlur(size, (0, 0), 4), 0)
-        spectra.append(rfft2(size / max(float(np.linalg.norm(size)), 1e-12), shape))
-    around = np.arange(-reach, reach + 1)
+        sizes.append(size / max(float(np.linalg.norm(size)), 1e-12))
+    features, sums = np.stack(sizes), ShiftedSums(mask, reach)
     directions = lights / np.maximum(np.linalg.norm(lights, axis=1, keepdims=True), 1e-12)
     pairs, shifts, weights = [], [], []
     for one, order in enumerate(np.argsort(-(directions @ directions.T), axis=1)):
-        for other in [place for place in order if place != one][:_NEIGHBOURS]:
-            match = irfft2(np.conj(spectra[one]) * spectra[other], shape)[around[:, None], around]
+        others = order[order != one][:_NEIGHBOURS]
+        for other, match in zip(others, sums.of(features[others], features[one]), strict=True):
             row, column = np.unravel_index(int(match.argmax()), match.shape)
-            pairs.append((one, int(other)))
+            pairs.append((int(other), one))
             shifts.append((int(column) - reach, int(row) - reach))
             weights.append(max(float(match.max()), 1e-3) ** 2)
     first, second = np.array(pairs).T

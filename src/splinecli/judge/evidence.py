@@ -4,10 +4,11 @@ that are fitted to them only once.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from splinecli.capture.light_rows import USUAL_FRAME, LightFrame
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.sample import Sample, closeup_of, sample_observations
 from splinecli.capture.source import Source
+from splinecli.images.registration import Shift, moved, shifts_of_detail, shifts_of_shading
 from splinecli.judge.explanations import (
     Doubt,
     Explanation,
@@ -25,16 +27,31 @@ from splinecli.judge.explanations import (
 )
 from splinecli.judge.judge_net import CLASSES, RIGHT, TRANSLUCENT, features_of, judge_net
 from splinecli.judge.light_check import LightCheck, check_lights
-from splinecli.judge.odd_images import ImageShift, find_shifts
-from splinecli.judge.shading_shifts import moved_back, shading_shifts
 from splinecli.judge.tilt import Tilt, find_tilt, fitted_map
 from splinecli.lights.light_fit import Factors, find_factors
 from splinecli.lights.rough_normals import median_turn_deg
-from splinecli.maths import Float64Array, Floats
+from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.maths.normals import unit
 from splinecli.maths.robust import solve_each
 
 _COARSE_PIXELS, _COARSE_VALUES = 3000, 100_000
+
+
+class ImageShift(NamedTuple):
+    """An image whose detail is `right` pixels to the right of, and `down` pixels below, its place
+    in the others.
+    """
+
+    place: int
+    right: int
+    down: int
+
+    def __str__(self) -> str:
+        """Return the shift as "2 right 1 up"."""
+        directions = [(self.right, "right", "left"), (self.down, "down", "up")]
+        return " ".join(
+            f"{abs(by)} {more if by > 0 else less}" for by, more, less in directions if by
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,22 +248,22 @@ class Evidence:
     @cached_property
     def shifts(self) -> list[ImageShift]:
         """The images that are shifted relative to the others."""
-        found = find_shifts(self.closeup) or (
-            find_shifts(self.sample) if self.sample.step > 1 else []
-        )
+        if self.factors is None:
+            return []
+        intensities = self.factors.intensities(self.directions[None])[0]
+        lights = self.directions * intensities[:, None]
+        shifts = _shifts_in(self.closeup, shifts_of_detail, lights)
+        if not shifts and self.sample.step > 1:
+            shifts = _shifts_in(self.sample, shifts_of_detail, lights)
+        found = list(shifts.values())
         if self.found:
             return found
-        step = self.sample.step
-        of_shading = shading_shifts(self.evened, self.directions)
-        shifts = {shift.place: shift for shift in found}
-        shifts |= {
-            place: ImageShift(place, step * right, step * down)
-            for place, (right, down) in of_shading.items()
-        }
+        distant = replace(self.sample, observations=self.observations)
+        shifts = _shifts_in(distant, shifts_of_shading, lights) | shifts
         together = [shifts[place] for place in sorted(shifts)]
         # The light check of the moved images is needed anyway, the check of the given ones rarely.
         if (
-            not of_shading
+            len(together) == len(found)
             or self.moved_back(together).light_check.order is None
             or self.light_check.order is None
         ):
@@ -260,18 +277,25 @@ class Evidence:
         """
         if self.found:
             return None
-        known, values = moved_back(self.evened, self._on_grid(self.shifts))
+        known, values = self._moved_values(self.evened, self.shifts)
         if not known.any():
             return None
         return median_turn_deg(
             self.evened.observations[known], self.directions, self.directions, values[known]
         )
 
-    def _on_grid(self, shifts: Sequence[ImageShift]) -> dict[int, tuple[int, int]]:
-        step = self.sample.step
-        return {
-            shift.place: (round(shift.right / step), round(shift.down / step)) for shift in shifts
-        }
+    @staticmethod
+    def _moved_values(sample: Sample, shifts: Sequence[ImageShift]) -> tuple[Bools, Float64Array]:
+        """Return which pixels (p,) all images show once those with shifts are moved back, and all
+        values (p, F).
+        """
+        images, mask = sample.images, sample.mask
+        known = mask.copy()
+        for shift in shifts:
+            by = round(shift.right / sample.step), round(shift.down / sample.step)
+            images[shift.place] = moved(images[shift.place], by)
+            known &= moved(mask, by) > 0
+        return known[mask], images[:, mask].T
 
     @cached_property
     def _moved(self) -> dict[tuple[ImageShift, ...], Evidence]:
@@ -283,7 +307,7 @@ class Evidence:
         """
         key = tuple(shifts)
         if key not in self._moved:
-            known, values = moved_back(self.sample, self._on_grid(shifts))
+            known, values = self._moved_values(self.sample, shifts)
             mask = np.zeros_like(self.sample.mask)
             mask[self.sample.mask] = known
             sample = replace(self.sample, observations=values[known], mask=mask)
@@ -363,6 +387,18 @@ class Evidence:
             linear=self.linear and reading.kind != "curve",
             curve=reading.amount if reading.kind == "curve" else self.curve,
         )
+
+
+def _shifts_in(
+    sample: Sample,
+    find: Callable[[Float64Array, Bools, Float64Array], dict[int, Shift]],
+    lights: Float64Array,
+) -> dict[int, ImageShift]:
+    """Return the shifts that are found in a sample, in pixels of the images."""
+    return {
+        place: ImageShift(place, sample.step * right, sample.step * down)
+        for place, (right, down) in find(sample.images, sample.mask, lights).items()
+    }
 
 
 def gray_intensities(intensities: Floats) -> Float64Array:

@@ -1,21 +1,14 @@
-"""Images that contradict the others, or are shifted because the camera moved, and a ground truth
-that does not fit.
+"""An image that contradicts the others, and a ground truth that does not fit.
 
 One image that contradicts the others: its lamp was moved or failed, its exposure differs, a shadow
 fell on it. Each image is left out in turn. If the residual nearly vanishes without one image, and
 remains without any other, this one is odd. So is an image that the factors of rank 3 explain far
 less well than all others. Thresholds are chosen as in light_check.py, after one image was dimmed,
 exchanged or half in shadow, or one light was moved by 40 degrees.
-
-Shifted images: under a fixed camera, the images of a matte object are a matrix of rank 3 (see
-light_fit). So each image can be predicted from the others under any light, and its fine detail is
-where the prediction has it. If it is elsewhere, the image is shifted: the peak of the normalised
-cross-correlation gives the distance.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,7 +16,7 @@ from splinecli.capture.light_rows import PLANE_FRAMES, LightFrame
 from splinecli.capture.sample import Sample
 from splinecli.lights.light_fit import Factors
 from splinecli.lights.rough_normals import rough_normals
-from splinecli.maths import Bools, Float32Array, Float64Array, Floats
+from splinecli.maths import Float64Array, Floats
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.records import capture_warnings as codes
 from splinecli.records.capture_warnings import CaptureWarning
@@ -100,170 +93,6 @@ def _brightness(factors: Factors, light_directions: Float64Array, place: int) ->
     # Largest residual, as a share of an odd image, at which it is considered the same image at
     # another brightness.
     return brightness if brightness > 0 and misfit < 0.3 else None
-
-
-_LARGEST_SHIFT = 8  # the largest shift that is looked for, in pixels of the sample
-# By how much a shift increases the correlation of details. In captures without shifts, of ten
-# images and more, a polished metal reached a correlation of 0.44, and an increase of 0.17.
-_LEAST_GAIN = 0.2
-
-
-class ImageShift(NamedTuple):
-    """An image whose detail is `right` pixels to the right of, and `down` pixels below, its place
-    in the others.
-    """
-
-    place: int
-    right: int
-    down: int
-
-    def __str__(self) -> str:
-        """Return the shift as "2 right 1 up"."""
-        directions = [(self.right, "right", "left"), (self.down, "down", "up")]
-        return " ".join(
-            f"{abs(by)} {more if by > 0 else less}" for by, more, less in directions if by
-        )
-
-
-def find_shifts(sample: Sample) -> list[ImageShift]:
-    """Return the images of a sample that are shifted by a pixel of its grid or more, in pixels of
-    the images.
-    """
-    import cv2
-
-    values = np.sqrt(np.maximum(sample.observations, 0), dtype=np.float32)
-    # 1 at pixels that stay in the mask under every shift that is looked for, 0 elsewhere
-    around = np.ones((2 * _LARGEST_SHIFT + 1, 2 * _LARGEST_SHIFT + 1), np.uint8)
-    eroded = cv2.erode(
-        sample.mask.astype(np.float32), around, borderType=cv2.BORDER_CONSTANT, borderValue=0
-    )
-    inner = np.asarray(eroded, np.float32)
-    # From fewer images, polished metals are predicted so badly that right images are named.
-    if values.shape[1] < 10 or np.count_nonzero(inner) < 1000:
-        return []
-    values = values / np.maximum(values.mean(axis=0), 1e-9)
-    detail = _Detail(sample.mask)
-
-    def shifts_against(predictors: Sequence[int]) -> list[ImageShift]:
-        images = zip(values.T, _predictions(values, predictors).T, strict=True)
-        shifts = enumerate(
-            _shift(detail.of(image), detail.of(predicted), inner) for image, predicted in images
-        )
-        return [
-            ImageShift(place, *(sample.step * by for by in shift))
-            for place, shift in shifts
-            if shift is not None
-        ]
-
-    found = shifts_against(range(values.shape[1]))
-    still = sorted({*range(values.shape[1])} - {shift.place for shift in found})
-    # A shifted image also disturbs the prediction of others. Four others or more predict an image.
-    return shifts_against(still) if found and len(still) >= 5 else found
-
-
-def _predictions(values: Float32Array, predictors: Sequence[int]) -> Float32Array:
-    """Return the predictions (P, F) of each image of (P, F) by the three strongest factors of the
-    other predictors.
-    """
-    products = values.T @ values
-    coefficients = np.zeros_like(products)
-    for place in range(len(products)):
-        others = [other for other in predictors if other != place]  # no image predicts itself
-        eigenvalues, directions = np.linalg.eigh(products[np.ix_(others, others)])
-        weights = directions[:, -3:] / np.sqrt(np.maximum(eigenvalues[-3:], 1e-12))
-        coefficients[others, place] = weights @ (weights.T @ products[others, place])
-    return np.asarray(values @ coefficients)
-
-
-def _shift(
-    detail: Float32Array, expected: Float32Array, inner: Float32Array
-) -> tuple[int, int] | None:
-    """Return the shift (right, down) in pixels of the mask's grid at which the detail of an image
-    agrees with what is expected; or None.
-    """
-    weighted = inner * detail
-    energy = (weighted * detail).sum() * (inner * expected * expected).sum()
-    # correlations are at most 1
-    if (weighted * expected).sum() > (1.001 - _LEAST_GAIN) * np.sqrt(energy):
-        return None
-    correlations = _correlations(detail, expected, inner)
-    right, down = _peak(correlations)
-    peak, unmoved = (
-        correlations[_LARGEST_SHIFT + down, _LARGEST_SHIFT + right],
-        correlations[(_LARGEST_SHIFT,) * 2],
-    )
-    at_edge = max(abs(right), abs(down)) == _LARGEST_SHIFT  # the peak may be beyond
-    # A shift is accepted if detail correlates so well at it, and so much better than without it.
-    if at_edge or peak < 0.2 or peak - unmoved < _LEAST_GAIN:
-        return None
-    around = correlations[_LARGEST_SHIFT + down - 1 :, _LARGEST_SHIFT + right - 1 :][:3, :3]
-    # The shortest shift that is accepted, in pixels of the sample. A tripod sinks by half a pixel.
-    if np.hypot(right + _top(*around[1]), down + _top(*around[:, 1])) < 0.8:
-        return None
-    # A moved camera shifts the whole picture. The highlights of a polished relief move in different
-    # directions.
-    for places, middle in zip(
-        np.indices(inner.shape), map(np.median, np.nonzero(inner)), strict=True
-    ):
-        for half in (inner * (places <= middle), inner * (places > middle)):
-            of_half = _peak(_correlations(detail, expected, half))
-            if max(abs(of_half[0] - right), abs(of_half[1] - down)) > 1:
-                return None
-    return right, down
-
-
-def _correlations(
-    detail: Float32Array, expected: Float32Array, inner: Float32Array
-) -> Float32Array:
-    """Return the correlations of two images (H, W) at shifts down and right up to
-    _LARGEST_SHIFT.
-    """
-    import cv2
-
-    most = slice(_LARGEST_SHIFT, -_LARGEST_SHIFT)
-    template, weights = (np.ascontiguousarray(part[most, most]) for part in (expected, inner))
-    found = cv2.matchTemplate(detail, template, cv2.TM_CCORR_NORMED, mask=weights)
-    return np.nan_to_num(np.asarray(found, np.float32), posinf=0, neginf=0)
-
-
-def _peak(correlations: Float32Array) -> tuple[int, int]:
-    down, right = np.unravel_index(correlations.argmax(), correlations.shape)
-    return int(right) - _LARGEST_SHIFT, int(down) - _LARGEST_SHIFT
-
-
-def _top(before: float, middle: float, after: float) -> float:
-    """Return the position of the peak of the parabola through three values, relative to the middle,
-    largest one.
-    """
-    return float(after - before) / 2 / max(float(2 * middle - before - after), 1e-9)
-
-
-class _Detail:
-    """The fine detail of images over their local contrast, in a mask (H, W)."""
-
-    def __init__(self, mask: Bools) -> None:
-        self._mask, self._inside = mask, mask.astype(np.float32)
-        # Standard deviations of the blur that is not detail, and of the local contrast
-        self._weights = {
-            deviation: np.maximum(self._blur(self._inside, deviation), 1e-3)
-            for deviation in (1.5, 4.0)
-        }
-
-    def of(self, values: Float32Array) -> Float32Array:
-        """Return the detail of values (P,) on a map (H, W), zero outside the mask."""
-        image = np.zeros(self._mask.shape, np.float32)
-        image[self._mask] = values
-        detail = (image - self._blur(image, 1.5) / self._weights[1.5]) * self._inside
-        contrast = self._blur(np.abs(detail), 4.0) / self._weights[4.0]
-        # Detail fades out below this share of the mean contrast.
-        least = 0.05 * np.abs(detail[self._mask]).mean() + np.float32(1e-12)
-        # limits the weight of highlights
-        return np.asarray((detail / (contrast + least)).clip(-4.0, 4.0), np.float32)
-
-    def _blur(self, array: Float32Array, deviation: float) -> Float32Array:
-        import cv2
-
-        return np.asarray(cv2.GaussianBlur(array, (0, 0), deviation))
 
 
 _FRAMES = [
