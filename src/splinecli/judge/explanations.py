@@ -6,7 +6,7 @@ fitted under each reading, and its residual is computed in stored values. judge_
 together.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -17,8 +17,9 @@ import numpy as np
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.sample import Sample
 from splinecli.maths import Float64Array, Floats
+from splinecli.maths.matte import SHADOW, Fit, fit_matte, fit_with_offsets
 from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.maths.robust import absolute_weights, inverse_3x3, lit_values, multiply_symmetric
+from splinecli.maths.robust import lit_values
 
 Kind = Literal["curve", "near", "offset", "intensities", "elevation"]
 ALL_KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -45,8 +46,6 @@ CLEAR = 0.95  # probability from which images are read so
 _FOR_MOST = 6  # fewer lights determine the constant light only
 # share of the residual at which a curve behind unequal lamps is better than one behind equal ones
 _MUCH_LESS = 0.6
-_ROWS, _COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]  # xx, yy, zz, xy, xz, yz of a product
-_SHADOW = 0.1  # of a pixel's largest value; smaller values are shadow
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,15 +75,6 @@ class Doubt(NamedTuple):
         return self.probability > CLEAR and not self.others
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A matte model under one reading."""
-
-    residual: float
-    normals: Float64Array
-    intensities: Float64Array
-
-
 class Explanations:
     """The pixels of a sample, whose observations are as stored, and the readings that were fitted
     to them.
@@ -108,7 +98,7 @@ class Explanations:
             values[clipped] = 0
         values = values.clip(min=0)
         # Three unknowns, and some more values that can contradict them.
-        enough = (values > _SHADOW).sum(axis=1) >= min(5, n_lights)
+        enough = (values > SHADOW).sum(axis=1) >= min(5, n_lights)
         self.values, self.lights, self.intensities = values[enough], lights, intensities
         self.rows, self.columns = (places[chosen[enough]] for places in np.nonzero(sample.mask))
         self.width = float(np.ptp(np.flatnonzero(sample.mask.any(axis=0))) + 1)
@@ -118,7 +108,7 @@ class Explanations:
     @cached_property
     def given(self) -> Fit:
         """The fit under the given reading."""
-        return _fit(self.values, self._with(self.lights))[0]
+        return fit_matte(self.values, self._with(self.lights))[0]
 
     @cached_property
     def readings(self) -> dict[Kind, Explanation]:
@@ -131,13 +121,13 @@ class Explanations:
         }
         if len(self.lights) < _FOR_MOST:
             return found
-        (free,) = _fit(self.values, vectors, free=True)
+        (free,) = fit_matte(self.values, vectors, free=True)
         unequal = _best("intensities", {1.0: free}, given)
         curve, behind = self._best_curve(), self._best_curve(free=True)
         # unequal lamps may hide a curve
         behind = replace(behind, ratio=behind.ratio * unequal.ratio)
         lights = np.stack([self._with(unit(self.lights * (1, 1, each))) for each in _HEIGHTS])
-        heights = dict(zip(_HEIGHTS, _fit(self.values, lights[:, None]), strict=True))
+        heights = dict(zip(_HEIGHTS, fit_matte(self.values, lights[:, None]), strict=True))
         return found | {
             "curve": behind if behind.ratio < _MUCH_LESS * curve.ratio else curve,
             "near": self._best_near(free),
@@ -152,13 +142,13 @@ class Explanations:
         none.
         """
         lights = self.lights if used is None else self.lights * used[:, None]
-        given = self.given if used is None else _fit(self.values, self._with(lights))[0]
+        given = self.given if used is None else fit_matte(self.values, self._with(lights))[0]
         return float(np.median(angle_between_deg(unit(given.normals), unit(reading.normals))))
 
     def _best_curve(self, *, free: bool = False) -> Explanation:
         # encoded shadows are brighter
         vectors, gammas = self._with(self.lights), (1.0, *_EXPONENTS)
-        given, *fits = _fit(self.values, vectors, gammas, free=free, shadow=0.35)
+        given, *fits = fit_matte(self.values, vectors, gammas, free=free, shadow=0.35)
         return _best("curve", dict(zip(_EXPONENTS, fits, strict=True)), given)
 
     def _best_near(self, given: Fit) -> Explanation:
@@ -166,7 +156,7 @@ class Explanations:
         lamps may be near.
         """
         lights = np.stack([self._with(self._near(widths)) for widths in _WIDTHS])
-        fits = dict(zip(_WIDTHS, _fit(self.values, lights, free=True), strict=True))
+        fits = dict(zip(_WIDTHS, fit_matte(self.values, lights, free=True), strict=True))
         return _best("near", fits, given)
 
     @cached_property
@@ -187,13 +177,13 @@ class Explanations:
         """Return fits with constant light, over the value of a pixel that faces the light, and
         around the best one.
         """
-        fits = _fit_with_offsets(self.values, vectors, [0.02 * 1.5**k for k in range(16)])
+        fits = fit_with_offsets(self.values, vectors, [0.02 * 1.5**k for k in range(16)])
         for _ in range(3):  # halve the interval around the best constant light
             tried = sorted(fits)
             best = tried.index(min(tried, key=lambda offset: fits[offset].residual))
             around = pairwise(tried[max(best - 1, 0) : best + 2])
             between = [float(np.sqrt(one * other)) for one, other in around]
-            fits |= _fit_with_offsets(self.values, vectors, between)
+            fits |= fit_with_offsets(self.values, vectors, between)
         return fits
 
     def _near(self, widths: float) -> Float64Array:
@@ -214,145 +204,11 @@ def _best(kind: Kind, fits: Mapping[float, Fit], given: Fit) -> Explanation:
     return Explanation(kind, amount, ratio, found.normals, found.intensities)
 
 
-def _fit(
-    values: Float64Array,
-    lights: Float64Array,
-    gammas: Sequence[float] = (1.0,),
-    *,
-    free: bool = False,
-    shadow: float = _SHADOW,
-) -> list[Fit]:
-    """Fit values^gamma = e max(l . b, 0) by least absolute deviations of the values, side by side
-    for each gamma and each set of lights.
-
-    Values (p, F) are scaled to 1; lights are (F, 3) or (H, p, F, 3), of any length. Intensities e
-    are 1 or free.
-    """
-    stored, vectors = values.T, _by_axis(lights)
-    gamma = np.array(gammas)[:, None, None]
-    lit = stored > shadow
-    # The slope of the linear value over the stored one, so that all readings have the same errors.
-    start = lit / (gamma * np.maximum(stored, shadow) ** (gamma - 1))
-    observed, weights, products = stored**gamma, start, _products(vectors)
-    count = max(len(gammas), len(vectors))
-    intensities = np.ones((count, len(stored)))
-    for _ in range(30 if free else 8):
-        e = intensities[..., None]
-        scaled = weights * e
-        normals = _solve(products, vectors, scaled * e, scaled * observed)
-        equal = _shade(normals, vectors)
-        weights = start * absolute_weights(observed - equal * e)
-        if free:
-            intensities = _intensities(observed, equal, weights, intensities)
-    left = np.abs(stored - np.maximum(equal * e, 0) ** (1 / gamma))[:, lit]
-    return _described(left, normals, intensities)
-
-
-def _fit_with_offsets(
-    values: Float64Array, lights: Float64Array, offsets: Sequence[float]
-) -> dict[float, Fit]:
-    """Fit values = max(l . b, 0) + offset |b|, as in _fit, for lights (F, 3) and each offset."""
-    stored, vectors = values.T, _by_axis(lights)
-    products, offset = _products(vectors), np.array(offsets)[:, None, None]
-    lit = stored > _SHADOW
-    start = lit.astype(np.float64)
-    # 0.8 is the usual cosine between a normal and the light under which its pixel is brightest.
-    above = np.maximum(stored - offset / (offset + 0.8), 0)
-    weights = np.broadcast_to(start, above.shape)
-    normals = _solve(products, vectors, weights, weights * above)
-    for _ in range(14):
-        # Newton's step on |b|, halved: with much constant light, whole steps miss. Its vectors are
-        # those of lights that the pixel faces, plus the offset along its normal.
-        facing = weights * (_shade(normals, vectors) > 0)
-        along = offset * np.moveaxis(unit(np.moveaxis(normals, 1, -1)), -1, 1)
-        light = _sum_over_lights(vectors, facing)
-        sums = _sum_over_lights(products, facing)
-        sums += along[:, _ROWS] * light[:, _COLUMNS] + along[:, _COLUMNS] * light[:, _ROWS]
-        sums += along[:, _ROWS] * along[:, _COLUMNS] * weights.sum(axis=1, keepdims=True)
-        right_side = _sum_over_lights(vectors, facing * stored)
-        right_side += along * (weights * stored).sum(axis=1, keepdims=True)
-        normals = (normals + _solution(sums, right_side)) / 2
-        predicted = np.maximum(_shade(normals, vectors), 0)
-        predicted += offset * np.linalg.norm(normals, axis=1, keepdims=True)
-        weights = start * absolute_weights(stored - predicted)
-    left = np.abs(stored - np.maximum(predicted, 0))[:, lit]
-    found = _described(left, normals, np.ones((len(offsets), len(stored))))
-    return dict(zip(offsets, found, strict=True))
-
-
 def constant_light(values: Floats, lights: Float64Array, share: float) -> Float64Array:
     """Return the constant light (p, 1) in values (p, F), which is a share of the value of a pixel
     that faces the light of a lamp; lights (F, 3) have any length.
     """
     largest = np.maximum(values.max(axis=1, keepdims=True), 1e-12)
     scaled = np.asarray(values / largest, np.float64)
-    normals = _fit_with_offsets(scaled, lights, [share])[share].normals
+    normals = fit_with_offsets(scaled, lights, [share])[share].normals
     return np.asarray(largest * share * np.linalg.norm(normals, axis=1, keepdims=True))
-
-
-def _described(
-    residuals: Float64Array, normals: Float64Array, intensities: Float64Array
-) -> list[Fit]:
-    """Return fits from their residuals (H, n), normals (H, 3, p) and intensities (H, F)."""
-    mean = residuals.mean(axis=1)
-    # The fits to few lights pass through most values. The median would be zero.
-    typical = np.median(residuals, axis=1) if intensities.shape[1] >= 8 else mean
-    sizes = np.sqrt(mean * typical).tolist()
-    return [Fit(*each) for each in zip(sizes, normals.swapaxes(1, 2), intensities, strict=True)]
-
-
-def _by_axis(lights: Float64Array) -> Float64Array:
-    """Return lights (F, 3) or (H, p, F, 3) as (1, 3, F, 1) or (H, 3, F, p)."""
-    if lights.ndim == 2:
-        return lights.T[None, :, :, None]
-    return np.ascontiguousarray(np.moveaxis(lights, (1, 2, 3), (3, 2, 1)))
-
-
-def _products(vectors: Float64Array) -> Float64Array:
-    """Return the products (H, 6, F, p) of the components of vectors (H, 3, F, p)."""
-    return vectors[:, _ROWS] * vectors[:, _COLUMNS]
-
-
-def _solve(
-    products: Float64Array, vectors: Float64Array, weights: Float64Array, weighted: Float64Array
-) -> Float64Array:
-    """Return scaled normals (H, 3, p) for weights (H, F, p) and weighted values; see
-    fit_scaled_normals.
-    """
-    return _solution(_sum_over_lights(products, weights), _sum_over_lights(vectors, weighted))
-
-
-def _solution(sums: Float64Array, right_side: Float64Array) -> Float64Array:
-    sums[:, :3] += 1e-6
-    covariance = inverse_3x3(tuple(sums.swapaxes(0, 1)), 1e-6)
-    return np.stack(multiply_symmetric(covariance, tuple(right_side.swapaxes(0, 1))), axis=1)
-
-
-def _sum_over_lights(terms: Float64Array, values: Float64Array) -> Float64Array:
-    """Return the sums (H, K, p) of terms (H, K, F, p) times values (H, F, p)."""
-    if terms.shape[3] == 1:
-        return np.asarray(terms[..., 0] @ values)
-    return np.asarray(np.einsum("hkfp,hfp->hkp", terms, values))
-
-
-def _shade(normals: Float64Array, vectors: Float64Array) -> Float64Array:
-    """Return the shading (H, F, p) of scaled normals (H, 3, p) under lights (H, 3, F, p)."""
-    if vectors.shape[3] == 1:
-        return np.asarray(vectors[..., 0].swapaxes(1, 2) @ normals)
-    return np.asarray(np.einsum("hkfp,hkp->hfp", vectors, normals))
-
-
-def _intensities(
-    observed: Float64Array, equal: Float64Array, weights: Float64Array, before: Float64Array
-) -> Float64Array:
-    """Return the next intensities (H, F) from the values (H, F, p) predicted for lights of
-    intensity 1.
-    """
-    # the rest may be shadow
-    weighted = weights * (equal > 0.2 * equal.max(axis=1, keepdims=True)) * equal
-    power = (weighted * equal).sum(axis=2)
-    found = (weighted * observed).sum(axis=2) / np.maximum(power, 1e-12)
-    found = np.where(power > 0, found, before)
-    found = np.clip(found / found.mean(axis=1, keepdims=True), 0.05, 20)
-    intensities = before * (found / before) ** 1.5  # larger changes save a third of the fits
-    return np.asarray(intensities / intensities.mean(axis=1, keepdims=True))
