@@ -129,6 +129,23 @@ def test_rotation_zoom_and_perspective_are_found(kind):
     assert residuals(found.transforms, true).max() < 0.15
 
 
+@parametrize("gloss", [0.0, 0.3, 2.0])
+@parametrize("textured", [True, False])
+def test_images_that_did_not_move_are_left_as_they_are(textured, gloss):
+    still = photographs(motions(0, "translation"), textured=textured, gloss=gloss)
+    found = align_images(still, MASK, LIGHTS)
+    assert (found.transforms == np.eye(3)).all()
+    assert found.unexplained is None
+
+
+@parametrize("textured", [True, False])
+def test_one_image_that_moved_by_a_pixel_is_found(textured):
+    true = motions(0, "translation")
+    true[4, 0, 2] = 1.0
+    found = align_images(photographs(true, textured=textured), MASK, LIGHTS)
+    assert residuals(found.transforms, true).max() < 0.1
+
+
 @parametrize(
     "spoil",
     [

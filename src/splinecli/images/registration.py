@@ -35,7 +35,7 @@ _LEAST_GAIN, _LEAST_PEAK = 0.1, 0.15
 # Images are still if correlations farther than two pixels from the peak are lower by so much, and
 # the peak of each is so near its place, as all are in root mean square. In unmoved captures, real
 # and rendered, single images reached 0.3 pixels.
-_CLEAR, _MOST_STILL, _USUAL_STILL = 0.15, 0.5, 0.15
+_CLEAR, _MOST_STILL, _USUAL_STILL = 0.15, 0.5, 0.2
 _MOST_VALUES = 2_000_000
 _SHORTEST = 0.8  # pixels; a tripod sinks by half a pixel
 # The share of the residual that a shift leaves, in the whole image and most halves of it. Gloss on
