@@ -1,10 +1,11 @@
 """Find images that are shifted relative to the others.
 
 Under a fixed camera, the other images predict each image of a matte object under its own light, up
-to highlights and shadows. The prediction is compared with the image at all shifts in two ways. Fine detail gives the shift of most objects exactly, and is not
-misled by gloss. Objects without detail are found by their shading and outline: the residual of the
-shifted image is computed with the light free, so a wrong light is not mistaken for a shift. On a
-ball, moved shading and a moved lamp differ only near the outline and by the shadow.
+to highlights and shadows. The prediction is compared with the image at all shifts in two ways. Fine
+detail gives the shift of most objects exactly, and is not misled by gloss. Objects without detail
+are found by their shading and outline: the residual of the shifted image is computed with the light
+free, so a wrong light is not mistaken for a shift. On a ball, moved shading and a moved lamp differ
+only near the outline and by the shadow.
 
 A shift is real if the image fits much better with it, in all parts of the object.
 """
