@@ -9,6 +9,7 @@ gradient is used for the search.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -29,6 +30,7 @@ from splinecli.maths.pixel_grid import Blocks
 from splinecli.system.machine import in_order, one_thread_each
 
 _GRID_PIXELS, _MOST_LIGHTS = 500, 30
+_AVERAGED = 400  # pixels of the capture, at least, for each pixel of the grid
 _STEPS, _STEP, _OWN_STEP = 14, 0.06, 0.01  # of the common matrix, and of each light
 _MOMENTUM, _SQUARES = 0.7, 0.9  # decay of the means of the gradient and of its square in Adam
 # for checking given lights
@@ -65,7 +67,7 @@ def best_lights(
     """
     count = observations.shape[1]
     used = _some_lights(count)
-    images = _Images.of(observations[:, used], mask)
+    images = _Images.of(observations, mask, used)
     errors = torch.tensor(np.radians(errors_deg[used]), dtype=torch.float32)
     follow = partial(_follow, images, errors, intensities_known=intensities_known)
     parts = [Lights(each.directions[used], each.intensities[used]) for each in starts]
@@ -123,7 +125,7 @@ class LightWitness:
         intensities.
         """
         used = _some_lights(len(given))
-        return cls(_Images.of(observations[:, used], mask, _FEW_PIXELS), used, given)
+        return cls(_Images.of(observations, mask, used, _FEW_PIXELS), used, given)
 
     def cost(self, directions: Float64Array) -> float:
         """Return the mean logarithm of the errors that the network predicts under lights (F, 3),
@@ -174,9 +176,16 @@ class _Images:
     )
 
     @classmethod
-    def of(cls, observations: Floats, mask: Bools, most: int = _GRID_PIXELS) -> _Images:
+    def of(
+        cls, observations: Floats, mask: Bools, used: Integers, most: int = _GRID_PIXELS
+    ) -> _Images:
+        step = max(1, math.isqrt(np.count_nonzero(mask) // (_AVERAGED * most)))
+        if step > 1:  # the mean of all pixels of a large capture is hardly better
+            some = np.zeros_like(mask)
+            some[::step, ::step] = True
+            observations, mask = observations[some[mask]], mask[::step, ::step]
         blocks = Blocks.over(mask, most)
-        values = blocks.average(observations, mask)
+        values = blocks.average(observations, mask)[:, used]
         brightest = values.max(axis=1)
         typical = np.quantile(brightest, 0.99)
         bright = brightest > 0.05 * typical
