@@ -8,7 +8,7 @@ detail that is real; see detail.py.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
@@ -207,7 +207,9 @@ class NetworkRefiner:
                 removed_blur=capture.removed_blur,
             )
 
-        features = self._maps(tile, FEATURE_CHANNELS, capture.lighting_at, features_of)
+        # With one thread for each part, the results do not depend on the number of threads.
+        run = side_by_side if self._device.type == "cpu" else map
+        features = self._maps(tile, FEATURE_CHANNELS, capture.lighting_at, features_of, run)
         mask = self._tensor(tile.mask)[None]
         normals, errors = self._average_turns(features, mask, seen, turns)
         if len(capture.signs) >= FEWEST_FOR_DETAIL:
@@ -250,18 +252,20 @@ class NetworkRefiner:
         columns: int,
         lighting_at: LightingAt,
         values_of: Callable[[PixelIndices, PixelLighting, slice], torch.Tensor],
+        run: Callable[..., Iterable[torch.Tensor]] = map,
     ) -> torch.Tensor:
         """Return maps (columns, h, w), zero outside the mask, of a tile's values (N, columns).
 
         `values_of` gives them from rows of the capture, their light and their slice of the tile's
-        pixels.
+        pixels. `run` calls it for each part of the pixels.
         """
         maps = torch.zeros(columns, *tile.mask.shape, device=self._device)
         rows = tile.rows[tile.mask]
         places = torch.from_numpy(np.flatnonzero(tile.mask)).to(self._device)
-        for part in slices(len(rows), LIT_AT_ONCE):
-            values = values_of(rows[part], lighting_at(rows[part]), part)
-            maps.view(columns, -1)[:, places[part]] = values.T
+        parts = [*slices(len(rows), LIT_AT_ONCE)]
+        values = run(lambda part: values_of(rows[part], lighting_at(rows[part]), part), parts)
+        for part, each in zip(parts, values, strict=True):
+            maps.view(columns, -1)[:, places[part]] = each.T
         return maps
 
     def _average_turns(
