@@ -18,6 +18,7 @@ from splinecli.images.alignment import (
     reduced,
     resample,
 )
+from splinecli.images.registration import are_still
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
 
@@ -136,6 +137,7 @@ def test_images_that_did_not_move_are_left_as_they_are(textured, gloss):
     found = align_images(still, MASK, LIGHTS)
     assert (found.transforms == np.eye(3)).all()
     assert found.unexplained is None
+    assert not are_still(still[:, :12], MASK[60:72], LIGHTS)  # too thin to be judged
 
 
 @parametrize("textured", [True, False])

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -90,15 +91,25 @@ def shifts_of_detail(images: Float64Array, mask: Bools, lights: Float64Array) ->
 def are_still(images: Floats, mask: Bools, lights: Float64Array) -> bool:
     """Return whether the detail of every image (H, W) is where the others predict it, beyond doubt.
 
-    See shifts_of_shading for the arguments; pixels beside the mask are used, too.
+    See shifts_of_shading for the arguments; pixels beside the mask are used, too. Of large
+    captures, four parts in full resolution are compared, so that rotations show as well.
     """
+    half = int(np.sqrt(_MOST_VALUES / len(images))) // 2
+    fits = max(mask.shape) <= 2 * half
+    shares, half = ((50,), half) if fits else ((25, 75), half // 2)
+    rows, columns = (np.percentile(places, shares).astype(int) for places in np.nonzero(mask))
+    for row, column in product(rows, columns):
+        part = slice(max(0, row - half), row + half), slice(max(0, column - half), column + half)
+        if not _is_still(np.asarray(images[:, *part], np.float64), mask[part], lights):
+            return False
+    return True
+
+
+def _is_still(images: Float64Array, mask: Bools, lights: Float64Array) -> bool:
     import cv2
 
-    # Of large captures, a part is compared in full resolution.
-    half = int(np.sqrt(_MOST_VALUES / len(images))) // 2
-    middles = (int(np.median(places)) for places in np.nonzero(mask))
-    part = tuple(slice(max(0, middle - half), middle + half) for middle in middles)
-    images, mask = np.asarray(images[:, *part], np.float64), mask[part]
+    if min(mask.shape) <= 2 * _DETAIL_REACH or np.count_nonzero(mask) < _DETAIL_PIXELS:
+        return False
     around = cv2.dilate(mask.astype(np.uint8), np.ones((2 * _DETAIL_REACH + 1,) * 2)) > 0
     model, detail = _MatteModel(images, around, lights), _Detail(around)
     middle = slice(_DETAIL_REACH - 2, _DETAIL_REACH + 3)
