@@ -248,7 +248,7 @@ def test_an_interruption_of_a_capture_ends_it(run, capture, monkeypatch):
 REFUSED_OPTIONS = """
 --json | --json prints a list at the end, but watch does not end
 --shard 1/2 | --shard splits a list of captures
-other | found other after the dashes, expected options of infer
+other | found other after '--', expected options for infer
 -o sphere/../sphere | the results would be among the captures
 --methd ls | no option --methd
 --method lss | no method named 'lss'

@@ -144,9 +144,7 @@ def watch(context: Context, options: WatchOptions) -> None:
             hint="Watch one folder for each shard",
         )
     if len(given["captures"]) > 1:
-        raise UsageError(
-            f"found {given['captures'][0]} after the dashes, expected options of infer"
-        )
+        raise UsageError(f"found {given['captures'][0]} after '--', expected options for infer")
     if output.resolve() == folder.resolve():
         raise UsageError(
             "the results would be among the captures", path=output, hint="Choose another -o OUT"

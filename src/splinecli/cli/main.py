@@ -267,7 +267,7 @@ def _expand(value: Any) -> Any:
 
 
 class Commands(TyperGroup):
-    """The command splinecli itself."""
+    """The `splinecli` command itself."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help in the same form as for each command."""

@@ -252,9 +252,10 @@ def _follow(
     steps: int = _STEPS,
     half_fall: float = 0.0,
 ) -> _Followed:
-    """Return the best lights on the path of a gradient descent (Adam, Kingma and Ba, ICLR 2015).
+    """Return the best lights found by gradient descent (Adam, Kingma and Ba, ICLR 2015).
 
-    From the start, all lights move by a common matrix, and each of them slightly on its own.
+    Starting from `start`, a common matrix transforms all lights, and each light also moves slightly
+    on its own.
     """
     directions = start.directions.copy()
     directions[:, 2] = directions[:, 2].clip(min=_LEAST_LIGHT_Z)

@@ -283,11 +283,11 @@ def _fit(
 def _compare(
     sample: LitPixels, slope: Tensor, offset: Tensor, weights: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the reflectance (P,) of a matte surface, and two sums (P,) that determine the trust.
+    """Return the reflectance (P,) of a matte surface, and two sums (P,) that weight the material.
 
-    Each observation is predicted from the others, by the material and by the matte surface, with
-    the weights of the robust fits. The ratio of the two sums is the share of the material that
-    minimises the squared error.
+    Each observation is predicted from the others twice, with the material and with the matte
+    surface, and the weights of the robust fits. The ratio of the two sums is the weight of the
+    material's prediction that minimises the squared error.
     """
     cosine = sample.geometry.n_dot_l.clamp(min=0)
     base, matte_weights = fit_base(sample, cosine, 0 * cosine, 0 * cosine, torch.zeros(1, 1))

@@ -401,7 +401,8 @@ def images_to_read(work: Work) -> int:
 def begin(
     source: Source, light_indices: Sequence[int] | None = None, options: RecipeOptions = USUAL
 ) -> Work:
-    """Return the work on the images of the chosen lights (None for all) before the first step.
+    """Return the initial Work, before the first step, for the images of the chosen lights (None for
+    all).
 
     Raises UsageError if an index is out of range or repeated, or if there are fewer than three.
     """

@@ -102,7 +102,7 @@ def add_capture(
     rows, columns = np.nonzero(capture.mask)
     used = normals.any(axis=1) & (rows % step == 0) & (columns % step == 0)
     if not used.any():
-        raise InputError("no pixel of the mask has a ground-truth normal", path=folder)
+        raise InputError("no pixel in the mask has a ground-truth normal", path=folder)
     mask = np.zeros_like(capture.mask)
     mask[capture.mask] = used
     directions = capture.light_directions.astype(np.float32)
