@@ -143,7 +143,7 @@ def estimate_normals(  # noqa: PLR0913 - keyword arguments suit a notebook
         finds_lights=light_directions is None,
         first_light=None if first_light is None else str(first_light),
     )
-    work = follow(begin(source, options=recipe), last="saturation")
+    work = follow(begin(source, options=recipe), until="judgement")
     options = MethodOptions(weights, rotations, batch_size, device, precision)
     estimator = make_estimator(method, options)
     estimate, _, _ = estimate_capture(work, lambda: estimator, distil=distil, progress=progress)

@@ -155,7 +155,7 @@ def test_the_number_of_trials_does_not_change_a_trial(folder, max_pixels):
 
 
 def observed(folder, lights=None):
-    return follow(begin(open_capture(folder), lights), last="observations")
+    return follow(begin(open_capture(folder), lights), until="lights")
 
 
 def test_a_part_of_the_images_and_pixels_keeps_the_level_of_its_images(folder):

@@ -29,7 +29,7 @@ def ball():
 def judged(ball, given, options=OPTIONS):
     images, mask, _ = ball
     source = open_arrays(images, given, mask, light_intensities=np.ones(12))
-    return follow(begin(source, None, options), last="mending").made
+    return follow(begin(source, None, options), until="refinement").made
 
 
 def test_right_lights_are_kept(ball):

@@ -260,7 +260,9 @@ def capture_figures(
     )
     # Under near lamps, or with a near camera, each pixel has its own light directions.
     if network is not None and capture.lamps is None and capture.camera_matrix is None:
-        whole = follow(replace(stored, options=protocol.recipe), "intensities", "saturation").made
+        whole = follow(
+            replace(stored, options=protocol.recipe), "intensities", until="judgement"
+        ).made
         png = _observation_maps(
             whole, capture, network, errors_deg[network.name], pixels, title=title
         )

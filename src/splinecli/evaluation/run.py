@@ -249,7 +249,7 @@ def read_first_draw(
     lights = range(protocol.skipped_lights(name), source.n_lights)
     stored = follow(
         begin(source, lights, RecipeOptions(as_stored=protocol.as_stored)),
-        last="observations",
+        until="lights",
         advance=lambda *_: progress(1 / len(lights)),
     )
     return stored, TrialSource(stored).see(trial)

@@ -179,11 +179,11 @@ class TrialSource:
             work = replace(work, capture=_with_noise(work.made, trial))
         work = replace(work, options=protocol.recipe)
         # The intensities are estimated from all pixels, before the scored pixels are chosen.
-        work = follow(work, "lights", "intensities")
+        work = follow(work, "lights", until="saturation")
         needs_all = work.options.finds_lights or work.options.refine_lights
         if pixels is not None and not needs_all and work.made.lamps is None:
             work, pixels = work.choose_pixels(pixels), None
-        capture = follow(work, "saturation", "refinement").made
+        capture = follow(work, "saturation").made
         if pixels is None:
             return capture
         # Near lamps require the surface, which is computed from all pixels together.
@@ -294,7 +294,7 @@ class CaptureReading:
         try:
             stored = follow(
                 begin(source, self.lights, RecipeOptions(as_stored=as_stored)),
-                last="observations",
+                until="lights",
                 advance=lambda *_: on_image(min(next(numbers), n_images), n_images),
             )
         except OSError as error:

@@ -198,7 +198,7 @@ def estimate_capture(
     clock = clock or Clock()
     clock.begin("check", note="checking")
     strict = work.options.strict
-    work = follow(work, "judgement", "mending")
+    work = follow(work, "judgement", until="refinement")
     prepared = work.made.warnings
     judged = work.judgement.warnings if work.judgement else ()
     remedy = work.judgement.remedy if work.judgement else None
@@ -206,7 +206,7 @@ def estimate_capture(
     if work.options.keeps_lights:
         mended -= FAULTS_OF_LIGHTS
     refuse_if_strict([*prepared, *judged], work.made.name, strict=strict, mended=mended)
-    capture = follow(work, "refinement", "refinement").made
+    capture = follow(work, "refinement").made
     if work.options.refine_lights:
         judged = tuple(warning for warning in judged if warning.kind != ROUGH_LIGHTS)
     warnings = [*prepared, *judged, *capture.warnings[len(prepared) :]]
@@ -422,7 +422,7 @@ def _prepare(source: CaptureSource, options: InferOptions, clock: Clock) -> Work
         maps=chosen_maps(options.maps, page=options.html),
     )
     clock.expect(seconds(height * width, distils=options.distil))
-    work = follow(work, last="saturation", advance=clock.begin("read", n_reads, "reading"))
+    work = follow(work, until="judgement", advance=clock.begin("read", n_reads, "reading"))
     rest = seconds(work.made.n_pixels, distils=options.distil)
     clock.expect({stage: rest[stage] for stage in rest if stage != "read"})
     return work

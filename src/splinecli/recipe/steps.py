@@ -274,7 +274,7 @@ def mend(work: Work, _: Callable[[], object]) -> Work:
         options, moved = replace(options, align=True), causes(IMAGES_SHIFTED)
     faults = [each.warning for each in remedy.faults if each.warning.kind in mended_kinds]
     try:
-        mended = follow(begin(source, work.indices, options), last="judgement") if faults else None
+        mended = follow(begin(source, work.indices, options), until="mending") if faults else None
     except InputError:  # images that cannot be aligned
         mended = None
     judged = None if mended is None else mended.judgement
@@ -383,11 +383,11 @@ _PLACES = {step.name: place for place, step in enumerate(STEPS)}
 def follow(
     work: Work,
     first: str = STEPS[0].name,
-    last: str = STEPS[-1].name,
+    until: str | None = None,
     advance: Advance = lambda amount, note: None,
 ) -> Work:
-    """Return the work after those steps from `first` to `last` that it needs."""
-    for step in STEPS[_PLACES[first] : _PLACES[last] + 1]:
+    """Return the work after those steps that it needs, from `first` to the one before `until`."""
+    for step in STEPS[_PLACES[first] : None if until is None else _PLACES[until]]:
         if step.is_wanted(work):
             work = step.run(work, lambda note=step.note: advance(1, note))  # type: ignore[misc]
     return work
@@ -429,7 +429,7 @@ def prepare_capture(
         >>> capture.observations.shape, capture.light_directions.shape
         ((11836, 3), (3, 3))
     """
-    return follow(begin(source, light_indices, options), last="saturation", advance=advance).made
+    return follow(begin(source, light_indices, options), until="judgement", advance=advance).made
 
 
 def read_capture(
