@@ -26,7 +26,7 @@ from splinecli.estimate.networks.weights import resolve_weights
 from splinecli.lights.least_curl import OPPOSITE, BestLights, Lights
 from splinecli.maths import Bools, Float64Array, Floats, Integers
 from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.maths.pixel_grid import Blocks
+from splinecli.maths.pixel_grid import Blocks, thin_out
 from splinecli.system.machine import in_order, one_thread_each
 
 _GRID_PIXELS, _MOST_LIGHTS = 500, 30
@@ -171,19 +171,16 @@ class _Images:
     """The bright pixels of images on a coarse grid, and the neighbours of inner pixels."""
 
     values: Tensor  # (p, F)
-    neighbours: (
-        Tensor  # (5, n), indices of pixels and their right, left, upper and lower neighbours
-    )
+    # (5, n), the indices of pixels and of their right, left, upper and lower neighbours
+    neighbours: Tensor
 
     @classmethod
     def of(
         cls, observations: Floats, mask: Bools, used: Integers, most: int = _GRID_PIXELS
     ) -> _Images:
         step = max(1, math.isqrt(np.count_nonzero(mask) // (_AVERAGED * most)))
-        if step > 1:  # the mean of all pixels of a large capture is hardly better
-            some = np.zeros_like(mask)
-            some[::step, ::step] = True
-            observations, mask = observations[some[mask]], mask[::step, ::step]
+        # The mean of all pixels of a large capture is hardly better.
+        observations, mask = thin_out(observations, mask, step)
         blocks = Blocks.over(mask, most)
         values = blocks.average(observations, mask)[:, used]
         brightest = values.max(axis=1)

@@ -381,17 +381,21 @@ def undecided_readings(seen: Evidence) -> list[CaptureWarning]:
     """Return a warning about other readings that are not probable enough to be reported as faults,
     but would together change the normals.
     """
-    errors_deg: dict[str, float] = {}
-    if seen.shares.get(TRANSLUCENT, 0.0) < LIKELY:  # otherwise it is named
-        errors_deg[TRANSLUCENT] = _TRANSLUCENT_DEG
-    if seen.tilt is not None and not seen.has_positions:
-        lights = seen.directions @ seen.tilt.matrix.T
-        errors_deg[TILTED] = median_turn_deg(seen.observations, seen.directions, lights)
-    shares = {kind: share for kind, share in seen.shares.items() if share > _NAMED_SHARE}
-    for kind in seen.open_kinds & shares.keys():
-        reading = seen.explanations.readings[kind]
-        errors_deg[kind] = seen.explanations.error_deg(reading, seen.estimated)
-    shares = {kind: shares[kind] for kind in errors_deg.keys() & shares.keys()}
+    readings: dict[str, Explanation] = {
+        kind: seen.explanations.readings[kind] for kind in seen.open_kinds
+    }
+    errors_deg = dict[str, float]()
+    for kind, share in seen.shares.items():
+        if share <= _NAMED_SHARE:
+            continue
+        if kind == TRANSLUCENT and share < LIKELY:  # otherwise it is named
+            errors_deg[kind] = _TRANSLUCENT_DEG
+        elif kind == TILTED and seen.tilt is not None and not seen.has_positions:
+            lights = seen.directions @ seen.tilt.matrix.T
+            errors_deg[kind] = median_turn_deg(seen.observations, seen.directions, lights)
+        elif kind in readings:
+            errors_deg[kind] = seen.explanations.error_deg(readings[kind], seen.estimated)
+    shares = {kind: seen.shares[kind] for kind in errors_deg}
     error_deg = sum(share * errors_deg[kind] for kind, share in shares.items())
     if error_deg < _UNDECIDED_DEG:
         return []

@@ -32,6 +32,7 @@ from splinecli.lights.light_fit import Factors, find_factors
 from splinecli.lights.rough_normals import median_turn_deg
 from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.maths.normals import unit
+from splinecli.maths.pixel_grid import thin_out
 from splinecli.maths.robust import solve_each
 
 _COARSE_PIXELS, _COARSE_VALUES = 3000, 100_000
@@ -178,12 +179,8 @@ class Evidence:
         step = int(np.ceil(np.sqrt(len(self.sample.observations) / most)))
         if step < 2:
             return self
-        part = np.zeros_like(self.sample.mask)
-        part[::step, ::step] = self.sample.mask[::step, ::step]
         sample = Sample(
-            self.observations[part[self.sample.mask]],
-            self.sample.mask[::step, ::step],
-            self.sample.step * step,
+            *thin_out(self.observations, self.sample.mask, step), self.sample.step * step
         )
         return replace(self, sample=sample, closeup=sample, lamps=None)
 

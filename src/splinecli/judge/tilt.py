@@ -110,13 +110,10 @@ def _around_axis(degrees: float, azimuths_deg: Float64Array) -> Float64Array:
 
 
 def _rotations(vectors_deg: Float64Array) -> Float64Array:
+    import cv2  # scipy.spatial takes a third of a second to import
+
     vectors = np.radians(np.pad(vectors_deg, ((0, 0), (0, 1))))
-    across = np.cross(np.eye(3), vectors[:, None])
-    # Rodrigues' formula
-    turns = np.linalg.norm(vectors, axis=1)[:, None, None] / np.pi
-    return np.asarray(
-        np.eye(3) + np.sinc(turns) * across + np.sinc(turns / 2) ** 2 / 2 * across @ across
-    )
+    return np.stack([np.asarray(cv2.Rodrigues(vector)[0], np.float64) for vector in vectors])
 
 
 def _curls(vectors: Float64Array, tilts: Float64Array, least: float) -> Float64Array:

@@ -44,7 +44,7 @@ from splinecli.lights.outline import DARK_SHARE, is_outlined, turn_at_outline
 from splinecli.lights.rough_normals import cast_shadows, smooth_normals
 from splinecli.maths import Bools, Float32Array, Float64Array
 from splinecli.maths.normals import angle_between_deg, unit
-from splinecli.maths.pixel_grid import Blocks, on_map
+from splinecli.maths.pixel_grid import Blocks, on_map, thin_out
 from splinecli.maths.robust import fit_robustly, shadow_weights
 from splinecli.surface.integration import integrate_normals
 from splinecli.system.machine import side_by_side
@@ -131,10 +131,7 @@ def find_lights(
     images are all alike, do not show one surface, or do not determine the lights.
     """
     step = max(1, math.ceil(math.sqrt(len(observations) / _MOST_PIXELS)))
-    if step > 1:
-        grid = np.zeros_like(mask)
-        grid[::step, ::step] = mask[::step, ::step]
-        observations, mask = observations[grid[mask]], mask[::step, ::step]
+    observations, mask = thin_out(observations, mask, step)
     _check_different(observations)
     guess, errors_deg, intensities = _ask_network(observations, mask)
     if intensities_known:

@@ -33,6 +33,17 @@ def on_map(values: NDArray[Value], mask: Bools) -> NDArray[Value]:
     return placed
 
 
+def thin_out(values: NDArray[Value], mask: Bools, step: int) -> tuple[NDArray[Value], Bools]:
+    """Return the values (p, ...) and the mask (h, w) of every step-th row and column of a mask (H,
+    W), whose pixels have values (P, ...).
+    """
+    if step == 1:
+        return values, mask
+    grid = np.zeros_like(mask)
+    grid[::step, ::step] = True
+    return values[grid[mask]], mask[::step, ::step]
+
+
 def bounds(mask: Bools) -> tuple[Integers, Integers]:
     """Return the first and last row (2,), and the first and last column (2,), of a mask."""
     rows, columns = (np.flatnonzero(mask.any(axis=axis))[[0, -1]] for axis in (1, 0))
