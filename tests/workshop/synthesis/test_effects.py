@@ -27,7 +27,13 @@ from splinecli.workshop.synthesis.batches import (
     restore,
 )
 from splinecli.workshop.synthesis.lights import draw_light_counts, draw_light_directions
-from splinecli.workshop.synthesis.pixels import Wall, draw_ambient, draw_visible_normals, draw_wall
+from splinecli.workshop.synthesis.pixels import (
+    PixelScene,
+    Wall,
+    draw_ambient,
+    draw_visible_normals,
+    draw_wall,
+)
 from splinecli.workshop.synthesis.principled import PrincipledMaterial
 
 
@@ -126,6 +132,15 @@ def test_a_known_wall_hides_the_lights_behind_it():
         ]
     )
     assert wall.visibility(lights)[0].tolist() == [0, 1, 0, 1, 0, 1, 1]
+
+
+def test_scattered_light_reaches_beyond_the_terminator():
+    tilted = torch.tensor([0.0, 60.0, 90.0, 110.0, 130.0]).deg2rad()
+    lights = torch.stack((tilted.sin(), 0 * tilted, tilted.cos()), dim=1)
+    up, none = torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 1)
+    scene = PixelScene(up, matte(1), (), none, none + 0.5)
+    beyond = (math.cos(math.radians(110)) + 0.5) / 1.5
+    assert scene.radiance(lights)[0].tolist() == approx([1, 2 / 3, 1 / 3, beyond, 0], abs=1e-4)
 
 
 def test_ambient_light():

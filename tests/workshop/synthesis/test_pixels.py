@@ -23,7 +23,8 @@ PLAIN = PixelGeneratorConfig(
     saturated_share=0.0,
     sensor_noise=False,
 )
-NOTHING = replace(PLAIN, wall_share=0.0, second_wall_share=0.0, ambient_share=0.0, mixed_share=0.0)
+SHARES = "wall_share second_wall_share ambient_share mixed_share translucent_share"
+NOTHING = replace(PLAIN, **dict.fromkeys(SHARES.split(), 0.0))
 
 
 def draw(pixels, config=None, seed=0):
@@ -65,7 +66,7 @@ def test_each_pixel_is_turned_by_its_own_angle(config):
     assert_close(turned.radiance(turned_lights), scene.radiance(lights), rtol=2e-3, atol=1e-4)
 
 
-@parametrize("share", "wall_share second_wall_share ambient_share mixed_share")
+@parametrize("share", SHARES)
 def test_each_effect_shows_in_the_scene_and_can_be_switched_off(share):
     def dense(config):
         return draw_scene(400, config, seeded(0)).dense_truth().values
@@ -76,6 +77,8 @@ def test_each_effect_shows_in_the_scene_and_can_be_switched_off(share):
         assert off.mixed is None
     elif share == "ambient_share":
         assert not off.ambient.any()
+    elif share == "translucent_share":
+        assert not off.wrap.any()
     else:
         assert len(off.walls) == 1
 
@@ -125,7 +128,7 @@ def test_pixels_of_a_capture_share_its_lights_and_its_exposure():
     exact = draw(160, SHARED)
     radiance = exact.truth.radiance(exact.light_directions) * exact.exposure * exact.valid
     clipped = radiance > 1
-    assert_close(exact.observations[~clipped], radiance[~clipped], rtol=1e-4, atol=1e-6)
+    assert_close(exact.observations[~clipped], radiance[~clipped], rtol=1e-3, atol=1e-6)
     brightest = exact.observations.unflatten(0, (16, 10)).amax(dim=(0, 2))
     assert (brightest > 0.15).all() and (brightest <= 1).all()
     assert draw(10, SHARED).captures == 1  # of fewer pixels than usual

@@ -171,6 +171,7 @@ class PixelGeneratorConfig(CaptureConfig):
     wall_share: Share = 0.45
     second_wall_share: Share = 0.2
     mixed_share: Share = 0.2
+    translucent_share: Share = 0.15
 
 
 @dataclass(frozen=True)
@@ -183,12 +184,18 @@ class PixelScene:
     material: PrincipledMaterial
     walls: tuple[Wall, ...]
     ambient: Tensor
+    # (P, 1), how far light that scatters below the surface reaches beyond the terminator, in n.l;
+    # 0 for opaque materials
+    wrap: Tensor
     mixed: PixelScene | None = None
     mixed_weight: Tensor | None = None
 
     def radiance(self, directions: Tensor) -> Tensor:
         """Return the radiance (P, D) under unit lights (D, 3) or (P, D, 3). Matte white facing the
         light gives 1.
+
+        Scattered light changes the cosine n.l of a matte surface to (n.l + wrap) / (1 + wrap), and
+        a share `wrap` of the change also reaches pixels behind walls.
         """
         visible = torch.ones((), device=self.normals.device)
         returned = self.material.albedo() * self.ambient
@@ -196,8 +203,12 @@ class PixelScene:
             visible = visible * wall.visibility(directions)
             returned = returned + wall.reflected(self.normals, self.material, directions)
         normal_z = self.normals[:, 2:]
-        direct = self.material.shade(dot(self.normals, directions), normal_z, directions[..., 2])
-        total = direct * visible + returned
+        cosine = dot(self.normals, directions)
+        direct = self.material.shade(cosine, normal_z, directions[..., 2])
+        wrapped = ((cosine + self.wrap) / (1 + self.wrap)).clamp(min=0) - cosine.clamp(min=0)
+        scattered = self.material.base * (1 - self.material.metallic) * wrapped
+        reached = self.wrap + (1 - self.wrap) * visible
+        total = direct * visible + scattered * reached + returned
         if self.mixed is not None and self.mixed_weight is not None:
             count = len(self.mixed_weight)
             of_mixed = directions if directions.ndim == 2 else directions[:count]
@@ -245,9 +256,11 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
 
     Pixel p belongs to capture p % G (CaptureConfig). All pixels of a capture share their materials
     (draw_shared_materials) and the probability of a wall: the usual share times U(-0.7, 2.3), or
-    zero if that is negative, as on convex objects.
+    zero if that is negative, as on convex objects. `translucent_share` of the captures scatter
+    light as wax or marble, with a wrap of U(0, 1)^2.
     """
     normals = draw_visible_normals(pixels, generator)
+    captures = config.captures(pixels)
     if config.capture_pixels == 1:
         material = draw_material(pixels, generator)
         hollow: float | Tensor = 1.0
@@ -255,7 +268,6 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
     else:
         # photograph_scene adds the ambient light that all pixels of a capture share
         ambient_share = 0.0
-        captures = config.captures(pixels)
         material = draw_shared_materials(pixels, captures, generator)
         hollow = draw_uniform(generator, captures, 1, low=-0.7, high=2.3).clamp(min=0)
         hollow = hollow.repeat(pixels // captures, 1)
@@ -271,9 +283,12 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
         if share > 0 and (config.cast_shadows or config.interreflections)
     )
     ambient = draw_ambient(pixels, ambient_share, generator)
+    wrap = draw_uniform(generator, captures, 1) ** 2
+    translucent = draw_uniform(generator, captures, 1) < config.translucent_share
+    wrap = (wrap * translucent).repeat(pixels // captures, 1)
     count = round(config.mixed_share * pixels)
     if not count:
-        return PixelScene(normals, material, walls, ambient)
+        return PixelScene(normals, material, walls, ambient, wrap)
     # Every second mixed pixel is an edge, with one material on two normals. The others have two
     # materials.
     edge = (torch.arange(count, device=normals.device) % 2 == 0)[:, None]
@@ -285,11 +300,11 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
     )
     moved = torch.cat((moved[:, :2], moved[:, 2:].abs().clamp(min=0.05)), dim=1)
     second_normals = torch.where(edge, torch.nn.functional.normalize(moved, dim=1), normals[:count])
-    mixed = PixelScene(second_normals, second, (), ambient[:count])
+    mixed = PixelScene(second_normals, second, (), ambient[:count], wrap[:count])
     weight = torch.rand(count, 1, generator=generator, device=normals.device) * torch.where(
         edge, 0.4, 0.7
     )
-    return PixelScene(normals, material, walls, ambient, mixed, weight)
+    return PixelScene(normals, material, walls, ambient, wrap, mixed, weight)
 
 
 def draw_shared_materials(

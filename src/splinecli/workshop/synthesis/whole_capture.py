@@ -140,9 +140,10 @@ def scatter(maps: Tensor, mask: Tensor, generator: torch.Generator) -> Tensor:
     surface.
 
     A share U(0.3, 1) of the light leaves the surface at a distance from its point of entry, with a
-    Gaussian distribution of sigma U(1, 4) pixels. Light is not scattered out of the object.
+    Gaussian distribution of sigma 10^U(0, 1) pixels. Light is not scattered out of the object.
     """
-    share, kernel = draw_number(generator, 0.3, 1), gaussian_kernel(draw_number(generator, 1, 4))
+    share, sigma = draw_number(generator, 0.3, 1), 10 ** draw_number(generator, 0, 1)
+    kernel = gaussian_kernel(sigma)
     inside = mask[None].float()
     spread = _blurred(maps * inside, kernel) / _blurred(inside, kernel).clamp(min=1e-3)
     return torch.lerp(maps, spread, share) * inside
