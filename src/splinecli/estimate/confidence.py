@@ -24,6 +24,9 @@ from splinecli.system.machine import side_by_side
 # with fewer, the residuals of a fit do not suffice to assess a capture
 _FEWEST_LIGHTS, _FEWEST_PIXELS = 5, 50
 _FITS = 4
+# The shape of the log-logistic distribution of an error that all normals share; four out of five
+# are within a factor of 1.6.
+COMMON_SHAPE = 3.5
 _LEAST_SHARE, _LEAST_DEG = 1e-3, 0.1  # added before a logarithm is taken
 
 
@@ -77,9 +80,7 @@ def add_common_error(errors: Float32Array, error_deg: float) -> None:
     own = 2 * errors[:, 0]
     errors[:, 0] = np.logaddexp(own, 2 * np.log(np.radians(error_deg))) / 2
     share = -np.expm1(own - 2 * errors[:, 0])
-    # The shape of an error that all normals share, which for four out of five is within a factor of
-    # 1.6.
-    errors[:, 1] += share * (np.log(3.5) - errors[:, 1])
+    errors[:, 1] += share * (np.log(COMMON_SHAPE) - errors[:, 1])
 
 
 class CaptureFeatures(NamedTuple):

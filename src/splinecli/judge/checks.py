@@ -10,6 +10,7 @@ from splinecli.capture import Capture
 from splinecli.capture.sample import leave_out_background
 from splinecli.capture.source import Source
 from splinecli.errors import InputError
+from splinecli.estimate.confidence import COMMON_SHAPE
 from splinecli.images.lamps import estimate_light_intensities
 from splinecli.judge.evidence import Evidence
 from splinecli.judge.explanations import CLEAR, LIKELY, SRGB_EXPONENT, Doubt, Explanation
@@ -407,9 +408,14 @@ def undecided_readings(seen: Evidence) -> list[CaptureWarning]:
     text = (
         f"The images may also be explained by {named}, which would rotate the normals by up to"
         f" {most_deg:.0f} degrees. The images do not rule this out, so the confidence is lowered."
+        " Check how the capture was made, or add lights from other sides."
     )
-    # With half of the error, the expected shares of accurate normals agree with the true ones.
-    return [CaptureWarning(codes.UNDECIDED, text, error_deg / 2)]
+    # No more normals can be accurate than with the probability that none of these readings is true.
+    # Otherwise, with half of the error, the expected shares agree with the true ones.
+    doubt = min(sum(shares[kind] for kind in shares if errors_deg[kind] > 5), 0.99)
+    of_share = 5 * (doubt / (1 - doubt)) ** (1 / COMMON_SHAPE)
+    error_deg = max(error_deg / 2, min(of_share, most_deg))
+    return [CaptureWarning(codes.UNDECIDED, text, error_deg)]
 
 
 def few_lights(seen: Evidence) -> list[Finding]:
@@ -607,7 +613,6 @@ def refuse_if_strict(
     """
     wrong = next((warning for warning in warnings if warning.is_error), None)
     if strict and wrong is not None:
-        how = "with this corrected" if wrong.kind in mended else "anyway"
-        raise InputError(
-            f"{name}: {wrong.text.removesuffix('.')}", hint=f"Leave --strict out to continue {how}"
-        )
+        corrected = "Without --strict, infer corrects this"
+        hint = corrected if wrong.kind in mended else "Leave --strict out to continue anyway"
+        raise InputError(f"{name}: {wrong.text.removesuffix('.')}", hint=hint)

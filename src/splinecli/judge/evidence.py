@@ -19,6 +19,7 @@ from splinecli.capture.sample import Sample, closeup_of, sample_observations
 from splinecli.capture.source import Source
 from splinecli.images.registration import Shift, moved, shifts_of_detail, shifts_of_shading
 from splinecli.judge.explanations import (
+    TIMES,
     Doubt,
     Explanation,
     Explanations,
@@ -217,8 +218,10 @@ class Evidence:
             return None
         total = float(sum(shares[kind] for kind in kinds))
         # Explanations that are at least this likely, relative to the likeliest one, are also named.
-        likely = tuple(kind for kind in others if shares[kind] > 0.3 * shares[best])
-        return Doubt(self.explanations.readings[best], total, likely)
+        readings = self.explanations.readings
+        worse = {kind for kind in others if readings[kind].ratio > TIMES * readings[best].ratio}
+        likely = tuple(k for k in others if shares[k] > 0.3 * shares[best] and k not in worse)
+        return Doubt(readings[best], total, likely, worse == set(others))
 
     @cached_property
     def tilt(self) -> Tilt | None:
@@ -264,8 +267,26 @@ class Evidence:
             or self.moved_back(together).light_check.order is None
             or self.light_check.order is None
         ):
-            return together
+            return self._of_one_place(together)
         return found  # the lights are in another order, so they cannot predict shading
+
+    def _of_one_place(self, shifts: list[ImageShift]) -> list[ImageShift]:
+        """Return the images that are at one place, if moving only these back explains much more.
+
+        If the camera moved once, both parts of the images differ from their common prediction.
+        """
+        groups = dict[tuple[int, int], list[ImageShift]]()
+        for shift in shifts:
+            groups.setdefault((shift.right, shift.down), []).append(shift)
+        if len(groups) != 2:
+            return shifts
+
+        def residual(moved: list[ImageShift]) -> float:
+            factors = self.moved_back(moved).factors
+            return np.inf if factors is None else factors.residual
+
+        best = min(groups.values(), key=residual)
+        return best if residual(best) < 0.8 * residual(shifts) else shifts
 
     @cached_property
     def shift_error_deg(self) -> float | None:

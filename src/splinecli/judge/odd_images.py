@@ -183,8 +183,8 @@ def _shifted(normals: Float64Array, truth: Floats, sample: Sample) -> list[Captu
     )
     text = (
         f"The ground truth is {before:.1f} degrees from normals that fit the images, but"
-        f" {after:.1f} degrees once a shift of {named} is undone: it is probably shifted against"
-        " the images, so the errors mean nothing."
+        f" {after:.1f} degrees once a shift of {named} is undone: it or some of the images are"
+        " probably shifted, so the errors mean nothing."
     )
     return [CaptureWarning(codes.GROUND_TRUTH_SHIFTED, text)]
 

@@ -20,6 +20,7 @@ from splinecli.capture import Capture, CaptureSource, capture_name
 from splinecli.capture.files import digest
 from splinecli.capture.formats.facts import StoredSize
 from splinecli.capture.formats.images import check_memory
+from splinecli.capture.light_files import rows_text
 from splinecli.capture.source import BYTES_OF_RESULTS, capture_bytes
 from splinecli.errors import OutputError, SplinecliError, UsageError
 from splinecli.estimate.inference import NormalEstimate, estimate_normals, find_surface, lighting_on
@@ -40,6 +41,7 @@ from splinecli.recipe.work import Work
 from splinecli.records.capture_warnings import (
     EIGHT_BIT,
     FAULTS_OF_LIGHTS,
+    LIGHTS_MENDED,
     LIGHTS_TILTED,
     LIGHTS_UNCERTAIN,
     NOT_DISTILLED,
@@ -55,6 +57,7 @@ from splinecli.records.output_files import (
     FOUND_LIGHTS,
     FOUND_MASK,
     MAPS,
+    MENDED_LIGHTS,
     PAGE,
     OutputMap,
 )
@@ -96,6 +99,7 @@ _LIGHTS_CAPTION = (
 
 # If all lights are tilted, the network's normals are tilted by less, so the tilt is undone in
 # steps. Each step must reduce the curl to this share or less.
+_OF_TILT = LIGHTS_TILTED, UNDECIDED  # warnings that a clear tilt replaces
 _TILTS, _LEAST_FALL, _SMALL_TILT_DEG, _LEAST_CHANGE = 3, 0.95, 4.0, 0.03
 
 
@@ -221,7 +225,7 @@ def estimate_capture(
     again = partial(estimate_normals, estimator=distilled or estimator, clock=clock)
     estimate, of_tilt = undo_tilt(estimate, again, mends=work.options.mends_lights)
     if of_tilt:
-        warnings = [warning for warning in warnings if warning.kind != LIGHTS_TILTED]
+        warnings = [warning for warning in warnings if warning.kind not in _OF_TILT]
     warnings += [*found, *of_tilt]
     warnings += [
         CaptureWarning(UNTRAINED_LIGHTS, text)
@@ -245,7 +249,7 @@ def undo_tilt(
     predicts.
     """
     capture = estimate.capture
-    others = tuple(each for each in capture.warnings if each.kind != LIGHTS_TILTED)
+    others = tuple(each for each in capture.warnings if each.kind not in _OF_TILT)
     capture = replace(capture, warnings=others)
     measured = capture.lamps is None and capture.camera_matrix is None
     if estimate.confidence_map is None or not measured or capture.light_errors_deg is not None:
@@ -495,6 +499,8 @@ def _make_files(
         light_plot = sky_plot(capture.light_directions, capture.name, errors_deg=errors_deg)
         pictures[_LIGHTS_CAPTION] = light_plot
         found.append(files.light_files(capture, light_plot))
+    if any(each.kind is LIGHTS_MENDED for each in capture.warnings):
+        found.append([(MENDED_LIGHTS, rows_text(capture.light_directions))])
     if source.automatic_mask is not None:
         found.append([(FOUND_MASK, encode_png(source.window.filled(capture.mask) * np.uint8(255)))])
     if options.surface:

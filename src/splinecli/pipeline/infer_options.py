@@ -83,8 +83,8 @@ AsStored = Annotated[
     bool,
     Option(
         "Input",
-        "Use the stored values: do not remove lens blur, restore saturated pixels or estimate"
-        " light intensities.",
+        "Use the stored values and the given lights: correct nothing, and do not remove lens blur,"
+        " restore saturated pixels or estimate light intensities.",
     ),
 ]
 GivenWhiteLevel = Annotated[
@@ -312,7 +312,8 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
     )
     strict: bool = flag(
         "Output",
-        "Fail with exit code 3 if the lights or the images are probably wrong, instead of warning.",
+        "Fail with exit code 3 if the lights or the images are probably wrong, instead of warning"
+        " or correcting them.",
     )
     # whether a surface in the unit of pixel_size is computed, too; a field of InferOptions
     surface = False

@@ -23,7 +23,11 @@ from splinecli.capture.record import Capture, check_light_indices
 from splinecli.capture.source import CaptureSource, Source
 from splinecli.errors import InputError
 from splinecli.images.alignment import MIN_IMAGES
-from splinecli.images.lamps import estimate_light_intensities, lamp_colours
+from splinecli.images.lamps import (
+    estimate_light_intensities,
+    lamp_colours,
+    turn_by_intensities_deg,
+)
 from splinecli.images.lens_blur import are_soft, remove_blur, surroundings
 from splinecli.images.mask import find_object
 from splinecli.images.saturation import restore_saturated
@@ -194,16 +198,20 @@ def find_lights(work: Work, _: Callable[[], object]) -> Work:
 
 def divide_by_intensities(work: Work, _: Callable[[], object]) -> Work:
     """Divide by light intensities, estimated from all pixels, if they are unknown."""
-    capture, intensities = work.made, work.found_intensities
+    capture, intensities, turn_deg = work.made, work.found_intensities, 0.0
     if intensities is None and not work.source.intensities_known:
         intensities = estimate_light_intensities(
             capture.observations, work.saturated.flags, work.lights_of
         )
+        if intensities is not None:
+            turn_deg = turn_by_intensities_deg(capture.observations, intensities, work.lights_of)
     if intensities is None:
         return work
     lowest, highest = intensities.min(), intensities.max()
     digits = 4 if f"{lowest:.2f}" == f"{highest:.2f}" else 2
     extent = f"from {lowest:.{digits}f} to {highest:.{digits}f} times their mean."
+    if turn_deg >= 1:
+        extent += f" Their errors turn the normals by about {turn_deg:.0f} degrees."
     text = (
         f"The light intensities were estimated from the images, because they are unequal: {extent}"
         " Use --intensities FILE if you have measured them, or --intensities equal to assume equal"
@@ -214,7 +222,10 @@ def divide_by_intensities(work: Work, _: Callable[[], object]) -> Work:
         capture,
         observations=np.divide(capture.observations, intensities, dtype=np.float32),
         estimated_intensities=intensities,
-        warnings=(*capture.warnings, CaptureWarning(ESTIMATED_INTENSITIES, text, again=again)),
+        warnings=(
+            *capture.warnings,
+            CaptureWarning(ESTIMATED_INTENSITIES, text, turn_deg, again=again),
+        ),
     )
     return replace(work, capture=capture)
 
@@ -247,6 +258,7 @@ def mend(work: Work, _: Callable[[], object]) -> Work:
     judgement, source, options = work.judgement, work.source, replace(work.options, mends=False)
     assert judgement is not None and judgement.remedy is not None  # see _mends
     remedy, notes, mended_kinds = judgement.remedy, list[CaptureWarning](), set[WarningKind]()
+    moved_intensities: Float64Array | None = None
     files = source if isinstance(source, CaptureSource) else None
 
     def causes(*kinds: WarningKind) -> str:
@@ -256,6 +268,7 @@ def mend(work: Work, _: Callable[[], object]) -> Work:
 
     keeps = options.keeps_lights or source.has_positions
     if remedy.lights is not None and not keeps and (remedy.lights[:, 2] > 0).all():
+        moved_intensities = _in_order_of(remedy.lights, source, work.indices)
         directions = source.light_directions.copy()
         directions[list(work.indices)] = remedy.lights
         source = replace(source, light_directions=directions)
@@ -277,6 +290,14 @@ def mend(work: Work, _: Callable[[], object]) -> Work:
         mended = follow(begin(source, work.indices, options), until="mending") if faults else None
     except InputError:  # images that cannot be aligned
         mended = None
+    if mended is not None and moved_intensities is not None and _errors(mended):
+        source = replace(source, light_intensities=moved_intensities)
+        other = follow(begin(source, work.indices, options), until="mending")
+        if len(_errors(other)) < len(_errors(mended)):
+            mended, why = other, "They and the intensities were corrected"
+            notes = [
+                replace(note, text=note.text.replace("They were corrected", why)) for note in notes
+            ]
     judged = None if mended is None else mended.judgement
     kept = {each.kind for each in judgement.warnings} - mended_kinds
     if (
@@ -295,6 +316,25 @@ def mend(work: Work, _: Callable[[], object]) -> Work:
     capture = replace(mended.made, warnings=(*prepared, *notes), mended=codes)
     judgement = judgement._replace(warnings=judged.warnings)
     return replace(mended, options=work.options, capture=capture, judgement=judgement)
+
+
+def _errors(work: Work) -> list[CaptureWarning]:
+    return [each for each in work.judgement.warnings if each.is_error] if work.judgement else []
+
+
+def _in_order_of(
+    lights: Float64Array, source: Source, indices: Sequence[int]
+) -> Float64Array | None:
+    """Return the intensities (F, 3) that belong to the lights in another order, if the images were
+    exchanged rather than lines of the light file; None if they are not in another order.
+    """
+    given, places = source.light_directions[list(indices)], np.array(indices)
+    order = np.argmax(lights @ given.T, axis=1)
+    if not source.intensities_measured or not np.allclose(given[order], lights, atol=1e-6):
+        return None
+    intensities = source.light_intensities.copy()
+    intensities[places] = intensities[places[order]]
+    return intensities
 
 
 def _without_align(work: Work) -> Work:

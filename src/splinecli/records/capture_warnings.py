@@ -150,7 +150,7 @@ GROUND_TRUTH_FRAME = fault(
 GROUND_TRUTH_SHIFTED = fault(
     "ground_truth_shifted",
     "The ground truth fits the images only after a shift",
-    "Align it with the images",
+    "Align both; the images may have moved",
 )
 GROUND_TRUTH_UPSIDE_DOWN = WarningKind(
     "ground_truth_upside_down", "The ground truth was upside down and was flipped"
@@ -237,7 +237,7 @@ LIGHTS_MATCHED = WarningKind(
 LIGHTS_MENDED = WarningKind(
     "lights_mended",
     "The light directions clearly [contradicted the images](input-checks.md#wrong-light-directions)"
-    " and were corrected",
+    " and were corrected; `infer` writes them to `mended_lights.txt`",
     "`--light-frame x-right,y-up` uses the file as it is",
 )
 LIGHTS_NEAR_AXIS = WarningKind(
@@ -253,7 +253,8 @@ LIGHTS_UNCHECKED = WarningKind(
 LIGHTS_TILTED = fault(
     "lights_tilted",
     "All lights are probably [tilted together](input-checks.md#wrong-light-directions)",
-    "Measure them in the frame of the camera, or use `info --mended-lights`",
+    "Measure them in the frame of the camera; without `--as-stored` and `--light-frame`, `infer`"
+    " corrects them",
 )
 LIGHTS_UNCERTAIN = WarningKind(
     "lights_uncertain",

@@ -22,6 +22,7 @@ NORMALS = {
 
 ERROR_MAP, GLOSS = "error_map.png", "metallic_roughness.png"
 REPORT, PAGE, FOUND_MASK = "report.json", "page.html", "found_mask.png"
+MENDED_LIGHTS = "mended_lights.txt"  # corrected light directions
 CAPTURE_SHEET = "capture.png"  # contact sheet of the capture's files; also written by `info`
 # Lights estimated by `infer`. If results and capture share a folder, the user's own files may have
 # these names.
@@ -208,5 +209,5 @@ def own_files() -> list[str]:
     """
     maps = (name for row in MAPS.values() for name in row.files.values())
     surface = (*file_names(tuple(SURFACE_FILES)), *LEVEL_NORMALS, SURFACE_REPORT)
-    own = (FOUND_MASK, CAPTURE_SHEET, PAGE, REPORT)
+    own = (FOUND_MASK, MENDED_LIGHTS, CAPTURE_SHEET, PAGE, REPORT)
     return [*NORMALS.values(), ERROR_MAP, *maps, *surface, *own]
