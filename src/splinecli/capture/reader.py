@@ -42,7 +42,7 @@ from splinecli.capture.light_files import (
     read_lights,
 )
 from splinecli.capture.light_rows import USUAL_FRAME, LightForm, LightFrame, RowForm
-from splinecli.capture.record import placeholders
+from splinecli.capture.record import ESTIMATE, placeholders
 from splinecli.capture.roles import find_ambient
 from splinecli.capture.source import CaptureSource
 from splinecli.errors import InputError, UsageError
@@ -59,7 +59,7 @@ EQUAL = "equal"  # instead of a file of intensities, states that all lights have
 class CaptureOptions:
     """Options for reading a capture. Files named here take precedence over files in the folder.
 
-    intensities: a file, or EQUAL.
+    intensities: a file, EQUAL or ESTIMATE.
     radiometry: how stored values are converted to linear light. If it has no ambient image, an
         image called `ambient` in the folder is subtracted.
     white_level: stored value from which observations are considered saturated, such as 4095 for 12
@@ -90,6 +90,11 @@ class CaptureOptions:
     def are_equal(self) -> bool:
         """Whether the user states that all lights have the same intensity."""
         return self.intensities is not None and str(self.intensities) == EQUAL
+
+    @property
+    def ignores_intensities(self) -> bool:
+        """Whether a file of intensities in the folder is ignored."""
+        return self.are_equal or str(self.intensities) == ESTIMATE
 
 
 def open_capture(folder: StrPath, options: CaptureOptions = CaptureOptions()) -> CaptureSource:
@@ -211,7 +216,7 @@ def _find_files(
     folder: Path, options: CaptureOptions
 ) -> tuple[CaptureFiles, lamp_files.LampFiles | None, RowForm]:
     """Return the files of a capture, its near lamps, and the form of the rows in its light file."""
-    intensities = None if options.are_equal else options.intensities
+    intensities = None if options.ignores_intensities else options.intensities
     given = (options.lights, intensities, options.mask, options.ground_truth)
     paths = (None if file is None else Path(file) for file in given)
     overrides = Overrides(*paths, needs_lights=options.needs_lights)
@@ -480,7 +485,7 @@ def _given_intensities(
     """Return the intensities (F, 3) given by options or files, or else the intensities found with
     the lights, or None.
     """
-    if options.are_equal:
+    if options.ignores_intensities:
         return None
     if files.light_intensities is None:
         return found

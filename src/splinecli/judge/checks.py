@@ -372,8 +372,8 @@ def _of_given_intensities(given: Float64Array, reading: Explanation, left: str) 
     )
     cause = f"The given light intensities do not fit the images: with others{how}, {left}."
     advice = (
-        "Check that their file is in the order of the images, or leave them out with --intensities"
-        " equal."
+        "Check that their file is in the order of the images, or ignore it with --intensities"
+        " estimate."
     )
     return cause, advice
 

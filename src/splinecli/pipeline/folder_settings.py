@@ -17,7 +17,7 @@ from splinecli.system.files import resolve
 
 SETTINGS = "splinecli.toml"
 CORRECT = "Correct the line, or remove it"
-_WORDS = {"lights": "estimate", "intensities": "equal"}  # instead of files
+_WORDS = {"lights": ("estimate",), "intensities": ("equal", "estimate")}  # instead of files
 OUTSIDE = "Copy the file into the folder, or pass it with the option on the command line"
 Options = TypeVar("Options", bound=records.Record)
 
@@ -55,7 +55,7 @@ def read_settings(folder: Path, kind: type[records.Record]) -> dict[str, Any]:
             one = records.converted(kinds[key], value, f"setting {key!r}", InputError)
         except InputError as error:
             raise fail(error.problem) from None
-        if records.is_file_name(kinds[key]) and one != _WORDS.get(key):
+        if records.is_file_name(kinds[key]) and one not in _WORDS.get(key, ()):
             if not resolve(folder / one).is_relative_to(resolve(folder)):
                 problem = f"{key} is {one!r}, expected a path inside the folder"
                 raise fail(problem, hint=OUTSIDE)
@@ -79,7 +79,9 @@ def settings_text(options: records.Record, kind: type[records.Record], folder: P
         value, key = getattr(options, field.name, field.default), field.name.replace("_", "-")
         if value == field.default:
             continue
-        if records.is_file_name(records.field_types(kind)[field.name]) and value != _WORDS.get(key):
+        if records.is_file_name(records.field_types(kind)[field.name]) and value not in _WORDS.get(
+            key, ()
+        ):
             path = resolve(Path(value))
             if not path.is_relative_to(resolve(folder)):
                 raise UsageError(f"--{key} {value} is outside {folder}", hint=OUTSIDE)

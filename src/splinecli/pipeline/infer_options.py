@@ -270,7 +270,8 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
     )
     intensities: FileName | None = option(
         "Lights",
-        "File of the light intensities: a line r g b for each image. Or the word equal.",
+        "File of the light intensities: a line r g b for each image. Or the word equal, or estimate"
+        " to ignore the file in CAPTURE.",
         "FILE",
         "equal, or estimated if the images differ clearly",
     )
@@ -372,7 +373,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
         """Raise InputError if a file is missing, or if the folder of --flat-field contains no
         images.
         """
-        intensities = None if self.intensities == EQUAL else self.intensities
+        intensities = None if self.intensities in (EQUAL, ESTIMATE) else self.intensities
         for name in (
             *(self.light_file, self.light_positions, intensities, self.camera_matrix),
             *(self.mask, self.crosstalk, self.ground_truth, self.ambient),

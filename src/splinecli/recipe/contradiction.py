@@ -68,7 +68,7 @@ def ask_network(work: Work, judgement: Judgement) -> Judgement:
     if of_found > least and stated < _LARGEST_ERROR_DEG and apart > _TIMES * stated:
         cause = (
             f"The lights of {work.source.lights_file.name} contradict the images, which fit other"
-            f" lights, {apart:.0f} degrees away on average, with an expected error of {stated:.0f}"
+            f" lights, {apart:.0f} degrees away on average, with an expected error of {stated:.1f}"
             " degrees."
         )
         text = (
