@@ -391,8 +391,11 @@ def _gather(
     named = {resolve(path) for path in overrides.named()}
     roles = [path for path in roles if resolve(path) not in named]
     others = tuple(sorted({*others, *roles}, key=files.natural_key))
-    mask = overrides.mask or files.find_named(folder, files.MASK)
-    mask = mask or files.find_named(images[0].parent, files.MASK)
+
+    def beside_or_above(names: Sequence[str]) -> Path | None:
+        return files.find_named(folder, names) or files.find_named(images[0].parent, names)
+
+    mask = overrides.mask or beside_or_above(files.MASK)
     warnings: tuple[CaptureWarning, ...] = ()
     if mask is None:
         mask, warnings = choose_mask(folder, images)
@@ -405,10 +408,9 @@ def _gather(
         folder,
         images,
         light_directions=lights if overrides.needs_lights else None,
-        light_intensities=overrides.intensities
-        or files.find_named(folder, ["light_intensities.txt"]),
+        light_intensities=overrides.intensities or beside_or_above(["light_intensities.txt"]),
         mask=mask,
-        ground_truth=overrides.ground_truth or files.find_named(folder, ground_truth),
+        ground_truth=overrides.ground_truth or beside_or_above(ground_truth),
         others=others,
         warnings=warnings,
     )

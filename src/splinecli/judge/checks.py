@@ -122,11 +122,8 @@ def odd_image(seen: Evidence) -> Iterator[Finding]:
     """Warn about an image that contradicts the others for a reason other than a shift."""
     for name, largest in zip(seen.names, seen.sample.observations.max(axis=0), strict=True):
         if largest <= 0:
-            text = (
-                f"{name} is black, probably because its lamp failed. Photograph it again, or leave"
-                " it out."
-            )
             place = seen.names.index(name)
+            text = f"{name} is black, probably because its lamp failed. {_again(seen, place)}"
             error_deg = _turn_by_deg(seen, [place])
             yield Finding(
                 CaptureWarning(codes.IMAGE_INCONSISTENT, text, error_deg), seen.without(place)
@@ -143,13 +140,19 @@ def odd_image(seen: Evidence) -> Iterator[Finding]:
     text = (
         f"{seen.names[odd.place]} contradicts the other images{how}: leaving it out reduces the"
         f" residual to {100 * odd.left:.0f} %. Its lamp may have moved or failed, its exposure may"
-        " differ, or a shadow may have fallen on the object. Photograph it again, or leave it"
-        " out."
+        f" differ, or a shadow may have fallen on the object. {_again(seen, odd.place)}"
     )
     error_deg = _turn_by_deg(seen, [odd.place])
     yield Finding(
         CaptureWarning(codes.IMAGE_INCONSISTENT, text, error_deg), seen.without(odd.place)
     )
+
+
+def _again(seen: Evidence, place: int) -> str:
+    """Return the advice about an image that is to be left out."""
+    others = [str(index) for index in seen.indices if index != seen.indices[place]]
+    named = f" {','.join(others)}" if len(others) <= 20 else ""
+    return f"Photograph it again, or leave it out with --light-indices{named}."
 
 
 def _turn_by_deg(seen: Evidence, places: list[int]) -> float | None:

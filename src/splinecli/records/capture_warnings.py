@@ -171,7 +171,9 @@ IMAGE_SCALE = fault(
 )
 IMAGES_ALIGNED = WarningKind(
     "images_aligned",
-    "The images were [aligned](image-preparation.md#moved-images), as `--align` requests",
+    "The images were [aligned](image-preparation.md#moved-images), as `--align` requests or because"
+    " they clearly moved",
+    "`--as-stored` keeps them in place",
 )
 IMAGES_LEFT_OUT = WarningKind(
     "images_left_out",
