@@ -7,6 +7,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+from numpy.testing import assert_allclose
 
 import splinecli
 from cli.conftest import read_report
@@ -59,6 +60,24 @@ def test_shifted_images_are_named(run, medallion):
     assert aligned["angular_error_deg"]["mean"] < stored["angular_error_deg"]["mean"]
     assert "images_aligned" in run(f"info {medallion} --json", says=words).json["warning_codes"]
     assert words.removesuffix(".") in refused(run, "--method ls")
+
+
+def test_a_camera_that_moved_once(run, medallion):
+    for number in range(1, 6):
+        move(medallion / f"{number:02}.png", 4, 4)
+    run(f"info {medallion}", says="5 of 10 images are shifted relative to the others")
+
+
+def test_exchanged_images_take_their_intensities_along(run, medallion):
+    one, other = medallion / "03.png", medallion / "08.png"
+    order = [0, 1, 7, 3, 4, 5, 6, 2, 8, 9]
+    lights = np.loadtxt(medallion / "light_directions.txt")
+    one.rename("one.png")
+    other.rename(one)
+    Path("one.png").rename(other)
+    run(f"infer {medallion} --method ls", says="They and the intensities were corrected")
+    assert codes() == ["lights_mended"]
+    assert_allclose(np.loadtxt("out/medallion/mended_lights.txt"), lights[order], atol=1e-5)
 
 
 def test_the_same_file_under_two_lights(run, medallion):

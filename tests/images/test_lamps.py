@@ -23,7 +23,7 @@ from scenes import (
 from splinecli.capture.arrays import open_arrays
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.capture.reader import CaptureOptions, open_capture
-from splinecli.images.lamps import estimate_light_intensities
+from splinecli.images.lamps import estimate_light_intensities, turn_by_intensities_deg
 from splinecli.lights.draws import draw_lights
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.maths.robust import fit_scaled_normals
@@ -138,6 +138,7 @@ def test_unequal_lights_are_estimated(n_lights, shine):
     found = estimate_light_intensities(observations, None, directions)
     assert found.mean() == approx(1)
     assert_allclose(found, intensities / intensities.mean(), rtol=0.02)
+    assert turn_by_intensities_deg(observations, found, directions) < 1
 
 
 @parametrize("shine", [0.0, 0.5, 3.0])
@@ -191,6 +192,7 @@ def test_flat_objects(widths, tilt):
 
     # The images leave the tilt open, which 0.05 makes 3 degrees.
     assert error_deg(found) < 3 + 60 * tilt < 0.5 * error_deg(np.ones(8))
+    assert turn_by_intensities_deg(observations, found, lambda rows: vectors[rows]) > 1
     assert estimate_light_intensities(np.float32(shaded), None, lambda rows: vectors[rows]) is None
 
 

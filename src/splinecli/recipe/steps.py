@@ -263,8 +263,9 @@ def mend(work: Work, _: Callable[[], object]) -> Work:
 
     def causes(*kinds: WarningKind) -> str:
         """Return the causes of the faults of these kinds, and record the kinds as corrected."""
-        mended_kinds.update(kinds)
-        return " ".join(each.cause for each in remedy.faults if each.warning.kind in kinds)
+        found = [each for each in remedy.faults if each.warning.kind in kinds]
+        mended_kinds.update(each.warning.kind for each in found)
+        return " ".join(each.cause for each in found)
 
     keeps = options.keeps_lights or source.has_positions
     if remedy.lights is not None and not keeps and (remedy.lights[:, 2] > 0).all():
