@@ -62,8 +62,8 @@ def integrate(options: IntegrateOptions) -> None:
 def evaluate(options: EvaluateOptions) -> int:
     """Compare methods by their mean angular error over random draws of K lights.
 
-    All methods use the same draws. Captures are read as infer reads them, but faults are not corrected; --as-stored reproduces
-    published tables.
+    All methods use the same draws. Captures are read as infer reads them, but faults are not
+    corrected; --as-stored reproduces published tables.
 
     Prints a table. Writes results.json, results.csv, table.md, table.tex and report.html to OUT,
     and a plot if you give several K or SIGMA. OUT/trials.jsonl stores finished trials: run the
