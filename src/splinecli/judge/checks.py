@@ -59,7 +59,7 @@ def shifted_images(seen: Evidence) -> Iterator[Finding]:
     if not shifts:
         return
     after = seen.moved_back(shifts)
-    if not (seen.found or _explains_more(after, seen)):
+    if not _explains_more(after, seen):
         return
     named = ", ".join(f"{names[shift.place]} {shift}" for shift in shifts[:_MOST_NAMED])
     more = f" and {len(shifts) - _MOST_NAMED} more" if len(shifts) > _MOST_NAMED else ""
@@ -73,13 +73,15 @@ def shifted_images(seen: Evidence) -> Iterator[Finding]:
 
 
 def _explains_more(after: Evidence, before: Evidence) -> bool:
-    """Return whether three images explain the others better once images are moved back, and the
-    normals have no more curl than before.
+    """Return whether three images explain the others better once images are moved back, and, under
+    given lights, the normals have no more curl than before.
     """
-    if after.factors is None or before.factors is None or not (after.tilt and before.tilt):
+    if after.factors is None or before.factors is None:
         return False
     explained = after.factors.residual < 0.95 * before.factors.residual
-    return explained and after.tilt.curl < 1.05 * before.tilt.curl
+    if before.found or not explained:
+        return explained
+    return bool(after.tilt and before.tilt and after.tilt.curl < 1.05 * before.tilt.curl)
 
 
 def other_scale(seen: Evidence) -> Iterator[Finding]:

@@ -425,8 +425,8 @@ def estimated_lights(errors_deg: Float64Array, *, requested: bool) -> CaptureWar
         why = ", because the capture has no light file"
         way_out = " If you have measured the lights, add --lights FILE."
     expected = (
-        f"Their expected error is {errors_deg.mean():.0f} degrees on average and"
-        f" {errors_deg.max():.0f} degrees for the worst one"
+        f"Their expected error is {errors_deg.mean():.1f} degrees on average and"
+        f" {errors_deg.max():.1f} degrees for the worst one"
     )
     return CaptureWarning(
         ESTIMATED_LIGHTS,
