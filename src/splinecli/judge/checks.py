@@ -35,9 +35,9 @@ LEAST_EXPECTED = 0.1  # smallest expected share of normals within 5 degrees with
 # because no reading reduces it as much with wrong lights or moved images.
 DECISIVE = 0.35
 _MOST_NAMED = 4  # shifted images in a sentence
-# Readings that are named although none is likely: the least probability of each, and the least
-# expected change of the normals, chosen on rendered captures (benchmarks/judgement.py).
-_NAMED_SHARE, _UNDECIDED_DEG = 0.03, 2.0
+# Readings that are named although none is likely: the least probability of each and of all, and the
+# least expected change of the normals, chosen on rendered captures (benchmarks/judgement.py).
+_NAMED_SHARE, _LEAST_DOUBT, _UNDECIDED_DEG = 0.03, 0.1, 2.0
 _TRANSLUCENT_DEG = 8.0  # the usual median error of normals of translucent objects
 
 
@@ -403,7 +403,7 @@ def undecided_readings(seen: Evidence) -> list[CaptureWarning]:
             errors_deg[kind] = seen.explanations.error_deg(readings[kind], seen.estimated)
     shares = {kind: seen.shares[kind] for kind in errors_deg}
     error_deg = sum(share * errors_deg[kind] for kind, share in shares.items())
-    if error_deg < _UNDECIDED_DEG:
+    if error_deg < _UNDECIDED_DEG or sum(shares.values()) < _LEAST_DOUBT:
         return []
     likeliest = sorted(shares, key=lambda kind: -shares[kind])[:3]
     named = " or ".join(

@@ -85,6 +85,7 @@ def describe_capture(
             **_report(work, n_reads),
             "warnings": [str(warning) for warning in warnings],
             "warning_codes": [warning.code for warning in warnings],
+            "mended": list(capture.mended),
         }
         if mended_lights is not None:
             mended = judgement.mended_lights
