@@ -78,6 +78,18 @@ def test_a_bowls_light_on_itself_is_found_at_any_exposure():
     assert np.abs(left - direct)[INSIDE].mean() < 0.1 * indirect.mean()
 
 
+def test_only_every_third_normal_is_read(monkeypatch):
+    monkeypatch.setattr(lighting, "LIT_AT_ONCE", 100)
+    normals, seen = np.full_like(BOWL, np.nan), DIRECT + INDIRECT
+    normals[::3] = BOWL[::3]
+
+    def lighting_at(rows):
+        return PixelLighting(seen[rows], LIGHTS)
+
+    found = find_indirect_light(MASK, seen, lighting_at, np.float32(normals), known=3)
+    assert (found.at(EVERYWHERE) / INDIRECT)[INSIDE].mean() == approx(1, abs=0.05)
+
+
 @parametrize("camera_matrix", [None, pinhole(200, 31.5, 31.5)])
 def test_it_is_found_under_near_lamps(camera_matrix):
     points = np.stack((X[MASK], Y[MASK], -BOWL[:, 2]), axis=1)

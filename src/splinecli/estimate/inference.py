@@ -218,7 +218,8 @@ def estimate_pixels(
         progress, clock: see estimate_normals.
     """
     clock, n_pixels = clock or Clock(), len(observations)
-    normals = np.empty((n_pixels, 3), np.float32)
+    # NaN reveals the use of normals that have not been estimated.
+    normals = np.full((n_pixels, 3), np.nan, np.float32)
     errors = np.empty((n_pixels, 2), np.float32) if estimator.has_confidence else None
 
     def estimate(

@@ -203,7 +203,8 @@ def find_indirect_light(
     """
     pixels = PixelPlaces(mask)
     step = known * max(1, len(normals) // (_GATHERED * known))
-    parts = partial(parts_of_pixels, len(normals))
+    # Each part begins with a pixel whose normal is known.
+    parts = partial(parts_of_pixels, len(normals), LIT_AT_ONCE // known * known)
     some = partial(parts, step=step)
 
     def matte_albedo(rows: PixelIndices) -> Float32Array:
