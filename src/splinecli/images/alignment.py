@@ -65,15 +65,17 @@ _SMALLEST_ENERGY, _CUT = (
 )
 _DARK, _SHADOW_WEIGHT = 0.1, 0.05
 _STEPS, _TRIALS = 15, 4
+_SAME_PLACE = 1.0  # pixels between images at one place
 _SIMPLER = 1.06  # a model with more parameters must reduce the residuals by this factor
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """How images moved relative to the first one, in pixels: x is the column, y the row.
+    """How images moved relative to one of them, in pixels: x is the column, y the row.
 
-    transforms: (F, 3, 3), from a pixel (x, y, 1) of the first image to the same point in each
-    image. moved_pixels: (F,), the root mean square motion over the object.
+    reference: the first image, or the first one at the place of the majority if there is such a
+    place. transforms: (F, 3, 3), from its pixel (x, y, 1) to the same point in each image.
+    moved_pixels: (F,), the root mean square motion over the object.
     fits: (F,), the correlation of the aligned image with its prediction from the others.
     """
 
@@ -82,6 +84,7 @@ class Alignment:
     moved_pixels: Float64Array
     fits: Float64Array
     largest: float  # motion of a pixel of the object, as a share of its longer side
+    reference: int = 0
 
     @property
     def unexplained(self) -> int | None:
@@ -99,8 +102,7 @@ class Alignment:
 
 
 def align_images(images: Float32Array, mask: Bools, lights: Float64Array | None) -> Alignment:
-    """Return how images (F, H, W) moved relative to the first one, whose object is in the mask (H,
-    W).
+    """Return how images (F, H, W) of an object in the mask (H, W) moved.
 
     Args:
         lights: (F, 3), towards the lights, or None if they are unknown.
@@ -143,6 +145,11 @@ def _described(
     rows, columns = np.nonzero(mask)
     places = np.stack((columns, rows, np.ones_like(rows))).astype(np.float64)
     moved, largest = [], 0.0
+    middle = transforms @ places.mean(axis=1)
+    middle /= middle[:, 2:]
+    usual = np.linalg.norm(middle - np.median(middle, axis=0), axis=1) < _SAME_PLACE
+    reference = int(usual.argmax()) if usual.mean() > 0.5 else 0
+    transforms = transforms @ np.linalg.inv(transforms[reference])
     for transform in transforms:
         there = transform @ places
         distance = np.hypot(*(there[:2] / there[2] - places[:2]))
@@ -151,7 +158,7 @@ def _described(
     side = max(np.ptp(rows), np.ptp(columns)) + 1
     if max(moved) < UNMOVED:
         transforms = np.repeat(np.eye(3)[None], len(transforms), 0)
-    return Alignment(model, transforms, np.array(moved), fits, largest / side)
+    return Alignment(model, transforms, np.array(moved), fits, largest / side, reference)
 
 
 def common_pixels(transforms: Float64Array, shape: Sequence[int]) -> Bools:

@@ -59,7 +59,7 @@ def shifted_images(seen: Evidence) -> Iterator[Finding]:
     if not shifts:
         return
     after = seen.moved_back(shifts)
-    if not _explains_more(after, seen):
+    if not explains_more(after, seen):
         return
     named = ", ".join(f"{names[shift.place]} {shift}" for shift in shifts[:_MOST_NAMED])
     more = f" and {len(shifts) - _MOST_NAMED} more" if len(shifts) > _MOST_NAMED else ""
@@ -72,7 +72,7 @@ def shifted_images(seen: Evidence) -> Iterator[Finding]:
     yield Finding(warning, after, not seen.found, cause=cause)
 
 
-def _explains_more(after: Evidence, before: Evidence) -> bool:
+def explains_more(after: Evidence, before: Evidence) -> bool:
     """Return whether three images explain the others better once images are moved back, and, under
     given lights, the normals have no more curl than before.
     """

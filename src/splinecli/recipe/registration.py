@@ -48,7 +48,7 @@ def compare_colours(
 
 
 def register(work: Work, advance: Callable[[], object]) -> Work:
-    """Align the images to the first of them; see align_images.
+    """Align the images to one of them; see align_images.
 
     Raises InputError if there are too few images, one does not fit the others, or they share too
     little of the object.
@@ -96,8 +96,8 @@ def register(work: Work, advance: Callable[[], object]) -> Work:
     moved, warnings = found.moved_pixels * stride, source.warnings
     if (found.transforms != np.eye(3)).any():
         text = (
-            f"The images were aligned to {names[0]}: they moved by up to {moved.max():.1f} pixels"
-            f" ({found.model})"
+            f"The images were aligned to {names[found.reference]}: they moved by up to"
+            f" {moved.max():.1f} pixels ({found.model})"
         )
         if share < 1:
             text += (
@@ -105,7 +105,7 @@ def register(work: Work, advance: Callable[[], object]) -> Work:
                 " every image"
             )
         warnings = (*warnings, CaptureWarning(IMAGES_ALIGNED, f"{text}."))
-    aligned = AlignedImages(names[0], found.model, transforms, moved, common)
+    aligned = AlignedImages(names[found.reference], found.model, transforms, moved, common)
     return replace(work, source=replace(source, alignment=aligned, warnings=warnings))
 
 

@@ -31,7 +31,8 @@ from splinecli.images.lamps import (
 from splinecli.images.lens_blur import are_soft, remove_blur, surroundings
 from splinecli.images.mask import find_object
 from splinecli.images.saturation import restore_saturated
-from splinecli.judge.checks import ALIGN_ADVICE, check_capture
+from splinecli.judge.checks import ALIGN_ADVICE, check_capture, explains_more
+from splinecli.judge.evidence import Evidence
 from splinecli.judge.explanations import SRGB_EXPONENT
 from splinecli.lights.light_fit import refine_capture
 from splinecli.lights.outline import is_outlined
@@ -299,6 +300,9 @@ def mend(work: Work, _: Callable[[], object]) -> Work:
             notes = [
                 replace(note, text=note.text.replace("They were corrected", why)) for note in notes
             ]
+    if mended is not None and moved:
+        before, after = (Evidence.of(each.source, each.made) for each in (work, mended))
+        mended = mended if explains_more(after, before) else None
     judged = None if mended is None else mended.judgement
     kept = {each.kind for each in judgement.warnings} - mended_kinds
     if (
