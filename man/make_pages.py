@@ -51,6 +51,7 @@ FILES = {
     " exr depth.exr.",
     "OUT/NAME/error_map.png": "If there are true normals: angular error with a color bar.",
     "OUT/NAME/capture.png": "Contact sheet of the images, each with its light, and of the mask.",
+    "OUT/NAME/mended_lights.txt": "If they were corrected: the light directions that were used.",
     "OUT/NAME/found_mask.png": "With --auto-mask: the mask of the object.",
     **{
         f"OUT/NAME/{', '.join(each.files.values())}": f"With --maps {each.name}: {each.content}."

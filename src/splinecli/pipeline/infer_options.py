@@ -215,7 +215,7 @@ class ReadingOptions(Record, frozen=True, kw_only=True):
     )
     align: bool = flag(
         "Input",
-        "Align the images to the first one, if they were shifted, rotated or zoomed between"
+        "Align the images to one of them, if they were shifted, rotated or zoomed between"
         " exposures.",
     )
     ground_truth: FileName | None = option(
