@@ -99,6 +99,7 @@ _LIGHTS_CAPTION = (
 
 # If all lights are tilted, the network's normals are tilted by less, so the tilt is undone in
 # steps. Each step must reduce the curl to this share or less.
+_TILT_ERROR_DEG = 2.0  # which remains after the lights were tilted back
 _OF_TILT = LIGHTS_TILTED, UNDECIDED  # warnings that a clear tilt replaces
 _TILTS, _LEAST_FALL, _SMALL_TILT_DEG, _LEAST_CHANGE = 3, 0.95, 4.0, 0.03
 
@@ -277,8 +278,12 @@ def undo_tilt(
             break
     if accepted is not estimate:
         codes = tuple(dict.fromkeys((*capture.mended, LIGHTS_TILTED.code)))
-        accepted = replace(accepted, capture=replace(accepted.capture, mended=codes))
-        return accepted, [lights_mended(cause)]
+        note = replace(lights_mended(cause), error_deg=_TILT_ERROR_DEG)
+        lights = accepted.capture.light_directions
+        capture = replace(
+            capture, light_directions=lights, mended=codes, warnings=(*capture.warnings, note)
+        )
+        return again(capture), [note]
     warning = CaptureWarning(LIGHTS_TILTED, f"{cause} {TILT_ADVICE}.", tilt.degrees)
     # With this warning, the confidence accounts for the tilt.
     return again(replace(capture, warnings=(*capture.warnings, warning))), [warning]
