@@ -248,7 +248,8 @@ def judge(work: Work, _: Callable[[], object]) -> Work:
     judgement = check_capture(work.source, work.made, strict=work.options.strict)
     if work.options.asks_network:
         judgement = ask_network(work, judgement)
-    return replace(work, judgement=judgement)
+    judged = replace(work, judgement=judgement)
+    return _without_align(judged) if work.options.align else judged
 
 
 def mend(work: Work, _: Callable[[], object]) -> Work:
@@ -343,7 +344,7 @@ def _in_order_of(
 
 
 def _without_align(work: Work) -> Work:
-    """Return the work without the advice to align in its warnings, because aligning has failed."""
+    """Return the work without the advice to align in its warnings, because aligning was tried."""
     assert work.judgement is not None
     warnings = tuple(
         replace(each, text=each.text.replace(ALIGN_ADVICE, "Photograph from a tripod."))
