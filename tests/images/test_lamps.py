@@ -229,13 +229,9 @@ def test_a_capture_without_a_file_of_intensities(tmp_path):
     # Given intensities replace estimates.
     np.savetxt(tmp_path / "light_intensities.txt", np.ones((8, 3)))
     assert prepare_capture(open_capture(tmp_path)).estimated_intensities is None
-    (tmp_path / "light_intensities.txt").unlink()
-    assert (
-        prepare_capture(
-            open_capture(tmp_path, CaptureOptions(intensities="equal"))
-        ).estimated_intensities
-        is None
-    )
+    for word in ("equal", "estimate"):
+        found = prepare_capture(open_capture(tmp_path, CaptureOptions(intensities=word)))
+        assert (found.estimated_intensities is None) == (word == "equal")
 
 
 @parametrize("name", "ballPNG catPNG")
