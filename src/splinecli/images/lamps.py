@@ -124,6 +124,10 @@ def turn_by_intensities_deg(
     The arguments are those of `estimate_light_intensities`, and its result.
     """
     rows, values = lit_values(observations, 0.1, min(2000, 100_000 // len(intensities)))
+    lit = (values / intensities > SHADOW).sum(axis=1)  # three leave no residual
+    rows, values = rows[lit > 3], values[lit > 3]
+    if not len(values):
+        return 0.0
     vectors = lights(rows) if callable(lights) else lights
     known = np.ones(values.shape, np.bool_)
     normals = _fit(values, known, intensities, vectors)
