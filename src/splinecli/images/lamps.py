@@ -31,8 +31,9 @@ Lights = Float64Array | Callable[[Integers], Float64Array]
 # the estimates are wrong.
 FEWEST_FOR_INTENSITIES = 6
 # Normals with a smaller spread (their second largest standard deviation) belong to a flat object,
-# such as a coin or a painting. Tilting all its normals together has the same effect as other
-# intensities, so the likeliest tilt is used.
+# such as a coin or a painting. Tilting all its normals together has nearly the same effect as other
+# intensities, so the result also depends on the likeliest tilt: the more, the less the images
+# reveal.
 FLAT_SPREAD = 0.35
 # standard deviation of the slope of flat objects towards the camera, in x and in y: 5 degrees
 TILT = 0.09
