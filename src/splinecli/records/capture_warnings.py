@@ -383,7 +383,7 @@ FAULTS_OF_LIGHTS = frozenset(
 )
 PROBABLY_WRONG = frozenset(code for code, kind in WARNINGS.items() if kind.is_error)
 # median error of the normals, in degrees, from a blur of 2 to 4 pixels
-SOFT_DEG = 4.0
+SOFT_DEG = 5.5
 # share of saturated observations above which a warning is given
 SATURATED_SHARE = 0.01
 
