@@ -69,7 +69,7 @@ def estimate_light_intensities(
     n_lights = observations.shape[1]
     if n_lights < FEWEST_FOR_INTENSITIES:
         return None
-    rows, values = lit_values(observations, 0.1, min(2000, 100_000 // n_lights))
+    rows, values = _some_values(observations)
     known = np.ones(values.shape, np.bool_) if missing is None else ~missing[rows]
     enough = known.sum(axis=1) >= FEWEST_FOR_INTENSITIES
     if enough.sum() < 100:
@@ -89,18 +89,17 @@ def estimate_light_intensities(
         intensities = intensities * fit.intensities
     if ((known & (scaled > SHADOW)).sum(axis=0) < 10).any():
         return None
+    intensities /= intensities.mean()
     normals = _fit(values, known, intensities, light_vectors)
-    flat = spread_of(unit(normals)) < FLAT_SPREAD
-    if flat:
+    if spread_of(unit(normals)) < FLAT_SPREAD:
         intensities = _of_least_deviations(values, known, intensities, light_vectors)
         normals = _fit(values, known, intensities, light_vectors)
         level = _likeliest_tilt(intensities, unit(normals), light_vectors)
         doubt = _tilt_variance(values / intensities, normals, known, light_vectors)
         share = doubt / (doubt + TILT**2)
         intensities = intensities ** (1 - share) * level**share
-    intensities /= intensities.mean()
-    normals = _fit(values, known, intensities, light_vectors)
-    if flat:
+        intensities /= intensities.mean()
+        normals = _fit(values, known, intensities, light_vectors)
         # A flat object may be nearer to its tilt under equal intensities than to the likeliest
         # tilt.
         directions, shown = _shown(intensities, unit(normals), light_vectors)
@@ -124,7 +123,7 @@ def turn_by_intensities_deg(
 
     The arguments are those of `estimate_light_intensities`, and its result.
     """
-    rows, values = lit_values(observations, 0.1, min(2000, 100_000 // len(intensities)))
+    rows, values = _some_values(observations)
     lit = (values / intensities > SHADOW).sum(axis=1)  # three leave no residual
     rows, values = rows[lit > 3], values[lit > 3]
     if not len(values):
@@ -138,12 +137,15 @@ def turn_by_intensities_deg(
     return _TURNED * float(np.degrees(turn))
 
 
+def _some_values(observations: Float32Array) -> tuple[Integers, Float64Array]:
+    return lit_values(observations, 0.1, min(2000, 100_000 // observations.shape[1]))
+
+
 def _tilt_variance(
     observed: Float64Array, normals: Float64Array, known: Bools, lights: Float64Array
 ) -> float:
     """Return the variance of the slopes of a flat object, which the images leave open."""
-    directions = unit(lights if lights.ndim == 2 else lights.mean(axis=0))
-    facing = np.maximum(directions @ unit(unit(normals).mean(axis=0)), _LOWEST_COSINE)
+    directions, facing = _plane_cosines(unit(normals), lights)
     changes = directions[:, :2] / facing[:, None]
     changes -= changes.mean(axis=0)
     certainty, _ = _sensitivity(observed, normals, known, lights)
@@ -227,10 +229,16 @@ def _shown(
     """Return unit directions (F, 3), and the brightness (F,) of a plane with the mean normal under
     each light.
     """
+    directions, facing = _plane_cosines(normals, lights)
+    return directions, intensities * facing
+
+
+def _plane_cosines(
+    normals: Float64Array, lights: Float64Array
+) -> tuple[Float64Array, Float64Array]:
+    """Return unit directions (F, 3), and their cosines (F,) with the mean normal."""
     directions = unit(lights if lights.ndim == 2 else lights.mean(axis=0))
-    return directions, intensities * np.maximum(
-        directions @ unit(normals.mean(axis=0)), _LOWEST_COSINE
-    )
+    return directions, np.maximum(directions @ unit(normals.mean(axis=0)), _LOWEST_COSINE)
 
 
 def _variance(shown: Float64Array, directions: Float64Array, tilt: Float64Array) -> float:

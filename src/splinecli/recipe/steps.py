@@ -306,11 +306,7 @@ def mend(work: Work, _: Callable[[], object]) -> Work:
         mended = mended if explains_more(after, before) else None
     judged = None if mended is None else mended.judgement
     kept = {each.kind for each in judgement.warnings} - mended_kinds
-    if (
-        mended is None
-        or judged is None
-        or any(each.is_error and each.kind not in kept for each in judged.warnings)
-    ):
+    if mended is None or judged is None or any(each.kind not in kept for each in _errors(mended)):
         return _without_align(work) if moved else work
     prepared = [
         replace(each, text=f"{moved} {each.text} --as-stored keeps their places.")
