@@ -97,10 +97,10 @@ _LIGHTS_CAPTION = (
     "The estimated lights around the camera axis; the radius of each circle is the expected error"
 )
 
-# If all lights are tilted, the network's normals are tilted by less, so the tilt is undone in
-# steps. Each step must reduce the curl to this share or less.
 _TILT_ERROR_DEG = 2.0  # which remains after the lights were tilted back
 _OF_TILT = LIGHTS_TILTED, UNDECIDED  # warnings that a clear tilt replaces
+# If all lights are tilted, the network's normals are tilted by less, so the tilt is undone in
+# steps. Each step must reduce the curl to this share or less.
 _TILTS, _LEAST_FALL, _SMALL_TILT_DEG, _LEAST_CHANGE = 3, 0.95, 4.0, 0.03
 
 
