@@ -296,11 +296,18 @@ def test_reading(tmp_path):
         assert find_exposure(read_header(write(tmp_path / f"b.{suffix}", None))) is None
 
 
-@parametrize("shot", [(1e-300, 8, 100), (0.1, 1e200, 100), (0.1, 8, 1e300)])
-def test_exposures_that_no_camera_has_are_ignored(shot):
+@parametrize(
+    ("shot", "kept"),
+    [
+        ((1e-300, 8, 100), None),
+        ((0.1, 1e200, 100), Exposure(0.1, None, 100)),
+        ((0.1, 8, 1e300), Exposure(0.1, 8, None)),
+    ],
+)
+def test_values_that_no_camera_has_count_as_missing(shot, kept):
     """EXIF may store them as doubles."""
     facts = ImageHeader(Path("a.tif"), exif=dict(zip((0x829A, 0x829D, 0x8827), shot, strict=True)))
-    assert find_exposure(facts) is None and exposure_factors([facts, facts]) is None
+    assert find_exposure(facts) == kept and exposure_factors([facts, facts]) is None
 
 
 def test_mixed_exposures_are_divided_out(tmp_path):
@@ -329,6 +336,15 @@ def test_exposures_that_are_one(tmp_path):
     folder = capture(tmp_path / "balanced", (1, 60), (1, 60), (1, 60))
     write(folder / "1.jpg", (1, 120), iso=200)
     open_capture(folder)
+    write(folder / "1.jpg", (1, 60), iso=0)  # incomparable
+    open_capture(folder)
+
+
+def test_manual_lenses_state_no_aperture(tmp_path):
+    folder = capture(tmp_path / "manual")
+    for number, seconds in enumerate(((1, 60), (1, 60), (1, 30))):
+        write(folder / f"{number}.jpg", seconds, f_number=0)
+    assert "from 1/60 s, ISO 100 to 1/30 s, ISO 100." in str(open_capture(folder).warnings[0])
 
 
 def turned(folder, name, orientation):

@@ -361,44 +361,60 @@ UPRIGHT = 1  # orientation of images that viewers do not rotate
 
 
 class Exposure(NamedTuple):
-    """Exposure time in seconds, f-number and ISO sensitivity."""
+    """Exposure time in seconds, f-number and ISO sensitivity, the last two None if not stated."""
 
     seconds: float
-    f_number: float
-    iso: float
+    f_number: float | None
+    iso: float | None
 
     @property
     def relative(self) -> float:
         """A number proportional to the brightness of the image."""
-        return self.seconds * self.iso / self.f_number**2
+        return self.seconds * (self.iso or 1) / (self.f_number or 1) ** 2
 
     def __str__(self) -> str:
         time = f"1/{1 / self.seconds:.0f}" if self.seconds < 0.3 else f"{self.seconds:g}"
-        return f"{time} s, f/{self.f_number:g}, ISO {self.iso:.0f}"
+        aperture = f", f/{self.f_number:g}" if self.f_number else ""
+        return f"{time} s{aperture}" + (f", ISO {self.iso:.0f}" if self.iso else "")
 
 
 def find_exposure(facts: ImageHeader) -> Exposure | None:
-    """Return the exposure of an image, or None if the file is damaged or a value is missing or
-    outside the range of real cameras.
+    """Return the exposure of an image, or None if the file is damaged or states no exposure time.
+
+    Values outside the range of real cameras count as missing. For example, manual lenses state no
+    f-number or zero.
     """
     try:
         if facts.exif is None and facts.kind == "RAW":
             numbers: tuple[Any, ...] = decoders.read_shot(facts.path)
         else:
-            numbers = tuple((facts.exif or {})[tag] for tag in _EXPOSURE)
+            numbers = tuple((facts.exif or {}).get(tag, 0) for tag in _EXPOSURE)
         # Some cameras state two ISO numbers.
-        exposure = Exposure(*(float(n[0] if isinstance(n, tuple) else n) for n in numbers))
+        values = [float(n[0] if isinstance(n, tuple) else n) for n in numbers]
     except Exception:  # damaged tags cause a dozen types of errors
         return None
-    ranges = zip(exposure, _EXPOSURE.values(), strict=True)
-    return exposure if all(least <= value <= most for value, (least, most) in ranges) else None
+    ranges = zip(values, _EXPOSURE.values(), strict=True)
+    seconds, *others = (
+        value if least <= value <= most else None for value, (least, most) in ranges
+    )
+    return None if seconds is None else Exposure(seconds, *others)
+
+
+def _comparable(images: Sequence[ImageHeader]) -> list[tuple[ImageHeader, Exposure]]:
+    """Return the images that state the same parts of their exposure as the first that does."""
+    found = [
+        (facts, exposure) for facts in images if (exposure := find_exposure(facts)) is not None
+    ]
+
+    def stated(exposure: Exposure) -> list[bool]:
+        return [value is None for value in exposure]
+
+    return [pair for pair in found if stated(pair[1]) == stated(found[0][1])]
 
 
 def check_exposures(images: Sequence[ImageHeader]) -> None:
     """Raise InputError if two images state different exposures."""
-    found = [
-        (facts, exposure) for facts in images if (exposure := find_exposure(facts)) is not None
-    ]
+    found = _comparable(images)
     for facts, exposure in found[1:]:
         first, expected = found[0]
         # Stated shutter speeds and ISO numbers are rounded.
@@ -422,7 +438,7 @@ def exposure_factors(images: Sequence[ImageHeader]) -> tuple[list[float], str] |
         check_exposures(images)
         return None
     except InputError:
-        found = [exposure for facts in images if (exposure := find_exposure(facts)) is not None]
+        found = [exposure for _, exposure in _comparable(images)]
         if len(found) < len(images):
             raise
     mean = sum(exposure.relative for exposure in found) / len(found)
