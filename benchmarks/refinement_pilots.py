@@ -2,13 +2,15 @@
 
     python benchmarks/refinement_pilots.py draw CAPTURES SET... --count 600
     python benchmarks/refinement_pilots.py draw UNSEEN SET... --count 120 --seed 1
-    python benchmarks/refinement_pilots.py train CAPTURES UNSEEN RUN --variant wide
+    python benchmarks/refinement_pilots.py join PIXELWISE REFINED START
+    python benchmarks/refinement_pilots.py train CAPTURES UNSEEN RUN --variant wide --start START
     python benchmarks/refinement_pilots.py report RUN...
 
-`draw` photographs scenes and stores the features of the nets, half of the cost of training. `train`
-continues the shipped nets. Both continue after an interruption. `report` prints the errors on the
-unseen captures, and their changes relative to the nets at the start, with the standard errors over
-captures.
+`draw` photographs scenes and stores the features of the nets, half of the cost of training. `join`
+writes the refinement nets of some weights after the pixelwise networks of others. `train` continues
+the nets of the start, and writes weights. It and `draw` continue after an interruption. `report`
+prints the errors on the unseen captures, and their changes relative to the nets at the start, with
+the standard errors over captures.
 """
 
 import argparse
@@ -30,7 +32,9 @@ from splinecli.estimate.networks.refine_net import split_features
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import resolve_weights
 from splinecli.maths.normals import angle_between_deg
+from splinecli.system.machine import choose_precision
 from splinecli.workshop.pixel_sets.store import open_pixel_set
+from splinecli.workshop.save_weights import save_weights
 from splinecli.workshop.synthesis import stream_seed
 from splinecli.workshop.training.config import PRESETS
 from splinecli.workshop.training.loop import learning_rate, start_network
@@ -75,6 +79,15 @@ def draw(folder: Path, sets: Sequence[Path], count: int, seed: int, weights: str
     print(f"{len(found)} captures, {np.mean(found):.3f} deg before refinement")
 
 
+def join(pixelwise: Path, refined: str, start: Path) -> None:
+    """Write weights with the pixelwise networks of some, which have an error head, and the
+    refinement nets of others.
+    """
+    network = resolve_weights(refined).network
+    network.load_state_dict(resolve_weights(str(pixelwise)).network.state_dict(), strict=False)
+    save_weights(network, start)
+
+
 def load(folder: Path) -> list[SceneMaps]:
     """Return the stored captures."""
     found = []
@@ -108,7 +121,13 @@ def errors_deg(network: SplineNet, captures: Sequence[SceneMaps]) -> list[float]
 
 
 def train(
-    captures: Path, unseen: Path, run: Path, variant: str, core_seconds: float, edge_weight: float
+    captures: Path,
+    unseen: Path,
+    run: Path,
+    variant: str,
+    start: str,
+    core_seconds: float,
+    edge_weight: float,
 ) -> None:
     """Train a variant until its time on the cores is spent, with the smoother captures first."""
     config = PRESETS["refine"]
@@ -116,7 +135,7 @@ def train(
     config = replace(config, network=network_config, learning_rate=RATE, minutes=1.0)
     torch.manual_seed(0)
     network = SplineNet(network_config)
-    start_network(config.start_from, network)
+    start_network(start, network)
     for name, parameter in network.named_parameters():
         parameter.requires_grad_(name.startswith("refine_net."))
     trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
@@ -137,7 +156,8 @@ def train(
     training, held = load(captures), load(unseen)
     training.sort(key=sharpness)
     pool = ScenePool((), network, config.pixels, 0)
-    evaluated = copy_of(network, average)
+    evaluated = SplineNet(network_config)
+    bfloat16 = choose_precision("auto", torch.device("cpu")) == "bfloat16"
     before = spent - time.process_time()
     saved = validated = spent
 
@@ -159,7 +179,9 @@ def train(
         generator = torch.Generator().manual_seed(stream_seed(0, step))
         network.train()
         maps = pool.draw(CAPTURES_PER_STEP, generator)
-        losses = refinement_losses(network, maps, detail_weight=1.0, edge_weight=edge_weight)
+        losses = refinement_losses(
+            network, maps, detail_weight=1.0, edge_weight=edge_weight, bfloat16=bfloat16
+        )
         optimizer.zero_grad()
         losses.total.backward()
         torch.nn.utils.clip_grad_norm_(trained, config.gradient_limit)
@@ -182,16 +204,10 @@ def train(
             validated = spent
             validate()
     validate()
+    save_weights(evaluated, run / "weights.safetensors")
     (run / "result.json").write_text(
         json.dumps({"variant": variant, "steps": step, "core_seconds": spent})
     )
-
-
-def copy_of(network: SplineNet, average: dict[str, Tensor]) -> SplineNet:
-    """Return a network of the same configuration with other weights."""
-    other = SplineNet(network.config)
-    other.load_state_dict(average)
-    return other
 
 
 def report(runs: Sequence[Path]) -> None:
@@ -221,12 +237,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in ("captures", "unseen", "run"):
         training.add_argument(name, type=Path)
     training.add_argument("--variant", choices=VARIANTS, default="today")
+    training.add_argument("--start", default="spline-net")
     training.add_argument("--core-seconds", type=float, default=7200)
     training.add_argument("--edge-weight", type=float, default=0.0)
+    joining = commands.add_parser("join")
+    joining.add_argument("pixelwise", type=Path)
+    joining.add_argument("refined")
+    joining.add_argument("start", type=Path)
     commands.add_parser("report").add_argument("runs", type=Path, nargs="+")
     options = vars(parser.parse_args(arguments))
     torch.set_num_threads(1)
-    run: Any = {"draw": draw, "train": train, "report": report}[options.pop("command")]
+    run: Any = {"draw": draw, "join": join, "train": train, "report": report}[
+        options.pop("command")
+    ]
     run(**options)
 
 

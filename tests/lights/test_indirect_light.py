@@ -16,7 +16,7 @@ from scenes import directions_at, parametrize, pinhole
 from splinecli.capture import Capture
 from splinecli.capture.near_lamps import NearLamps
 from splinecli.estimate.inference import estimate_normals
-from splinecli.estimate.methods import MethodOptions, make_estimator
+from splinecli.estimate.methods import make_estimator
 from splinecli.estimate.networks.refine_net import channels
 from splinecli.estimate.refinement.refiner import NetworkRefiner
 from splinecli.lights import lighting
@@ -163,7 +163,7 @@ def test_shipped_weights_estimate_a_bowl_better_without_its_own_light():
 
 
 def test_the_refinement_net_learns_from_what_it_sees_in_use():
-    estimator = make_estimator("spline-net", MethodOptions(precision="float32"))
+    estimator = make_estimator("spline-net")
     features = pixel_features(
         estimator.network,  # type: ignore[attr-defined]
         torch.from_numpy(CAPTURE.observations),

@@ -266,7 +266,8 @@ def test_confidence_on_generated_pixels():
         usual_lights=10,
         max_lights=10,
         capture_pixels=64,
-        translucent_share=0,  # not in the training of these weights
+        translucent_share=0,  # not in the training of these weights, and neither are flat objects
+        flat_share=0,
     )
     batch = PixelGenerator(config, torch.Generator().manual_seed(77)).draw(64 * 100)
     network = resolve_weights("spline-net").network

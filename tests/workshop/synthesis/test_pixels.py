@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from pytest import approx
 from scipy import stats
 from torch.testing import assert_close
 
@@ -81,6 +82,17 @@ def test_each_effect_shows_in_the_scene_and_can_be_switched_off(share):
         assert not off.wrap.any()
     else:
         assert len(off.walls) == 1
+
+
+def test_flat_captures_have_one_tilt_each():
+    config = replace(NOTHING, capture_pixels=64, flat_share=1.0)
+    normals = draw_scene(64 * 200, config, seeded(0)).normals.unflatten(0, (64, 200))
+    slopes = normals[..., :2] / normals[..., 2:]
+    # Within a capture, sigma is 10^U(-1.7, -0.4), with a median of 0.09.
+    sigma = slopes.std(dim=0).median(dim=0).values
+    assert sigma.sub(10**-1.05).abs().max() < 0.03
+    # The tilts have slopes of 0.7 U(0, 1)^(1/2), whose mean is two thirds of 0.7.
+    assert slopes.mean(dim=0).norm(dim=1).mean() == approx(0.7 * 2 / 3, abs=0.03)
 
 
 def test_mixed_pixels_lie_between_their_surfaces():

@@ -172,6 +172,7 @@ class PixelGeneratorConfig(CaptureConfig):
     second_wall_share: Share = 0.2
     mixed_share: Share = 0.2
     translucent_share: Share = 0.15
+    flat_share: Share = 0.25  # captures of a nearly flat surface, such as a coin or a painting
 
 
 @dataclass(frozen=True)
@@ -250,6 +251,23 @@ def draw_visible_normals(pixels: int, generator: torch.Generator) -> Tensor:
     )
 
 
+def draw_flat_normals(pixels: int, captures: int, generator: torch.Generator) -> Tensor:
+    """Draw the unit normals (P, 3) of a nearly flat surface for each capture; pixel p belongs to
+    capture p % captures.
+
+    Each surface is tilted by a slope of 0.7 U(0, 1)^(1/2) in a random direction. The slopes of its
+    detail are Gaussian, with a sigma of 10^U(-1.7, -0.4).
+    """
+    uniform = partial(draw_uniform, generator, captures, 1)
+    azimuth, slope = uniform(high=2 * math.pi), 0.7 * uniform().sqrt()
+    tilt = torch.cat((azimuth.cos(), azimuth.sin()), dim=1) * slope
+    sigma = 10 ** uniform(low=-1.7, high=-0.4)
+    detail = torch.randn(pixels, 2, generator=generator, device=generator.device)
+    slopes = tilt.repeat(pixels // captures, 1) + sigma.repeat(pixels // captures, 1) * detail
+    upright = torch.nn.functional.pad(slopes, (0, 1), value=1.0)
+    return torch.nn.functional.normalize(upright, dim=1)
+
+
 def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Generator) -> PixelScene:
     """Draw random pixels. Half of the mixed pixels are on an edge, with a second normal; half blend
     two materials.
@@ -257,7 +275,8 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
     Pixel p belongs to capture p % G (CaptureConfig). All pixels of a capture share their materials
     (draw_shared_materials) and the probability of a wall: the usual share times U(-0.7, 2.3), or
     zero if that is negative, as on convex objects. `translucent_share` of the captures scatter
-    light as wax or marble, with a wrap of U(0, 1)^2.
+    light as wax or marble, with a wrap of U(0, 1)^2. `flat_share` of the captures are of a nearly
+    flat surface (draw_flat_normals).
     """
     normals = draw_visible_normals(pixels, generator)
     captures = config.captures(pixels)
@@ -271,6 +290,12 @@ def draw_scene(pixels: int, config: PixelGeneratorConfig, generator: torch.Gener
         material = draw_shared_materials(pixels, captures, generator)
         hollow = draw_uniform(generator, captures, 1, low=-0.7, high=2.3).clamp(min=0)
         hollow = hollow.repeat(pixels // captures, 1)
+        flat = draw_uniform(generator, captures, 1) < config.flat_share
+        normals = torch.where(
+            flat.repeat(pixels // captures, 1),
+            draw_flat_normals(pixels, captures, generator),
+            normals,
+        )
     walls = tuple(
         draw_wall(
             normals,

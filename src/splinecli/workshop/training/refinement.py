@@ -28,6 +28,7 @@ from splinecli.estimate.refinement.features import (
 )
 from splinecli.images.lens_blur import REACH
 from splinecli.lights.lighting import IndirectLight, PixelIndices, PixelLighting, parts_of_pixels
+from splinecli.system.machine import choose_precision
 from splinecli.workshop.pixel_sets.store import Entry, PixelSet
 from splinecli.workshop.synthesis import stream_seed
 from splinecli.workshop.synthesis.batches import CaptureConfig
@@ -211,11 +212,13 @@ def pixel_features(
 ) -> Tensor:
     """Return the refinement net's features (P, FEATURE_CHANNELS) for the pixels of a mask (H, W).
 
-    They are the same as at inference in float32.
+    They are the same as at inference.
     """
     method = "spline-net" if network.config.interpolates else "cnn-ps"
     loaded = LoadedNetwork(network.eval(), "in training", "")
-    estimator = NetworkEstimator(method, loaded, device=network.cells.device, precision="float32")
+    device = network.cells.device
+    precision = choose_precision("auto", device)
+    estimator = NetworkEstimator(method, loaded, device=device, precision=precision)
     directions = light_directions.numpy()
 
     def lighting_without(indirect: IndirectLight | None, rows: PixelIndices) -> PixelLighting:
