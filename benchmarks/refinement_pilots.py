@@ -91,7 +91,7 @@ def join(pixelwise: Path, refined: str, start: Path) -> None:
 def load(folder: Path) -> list[SceneMaps]:
     """Return the stored captures."""
     found = []
-    for path in sorted(folder.glob("*[0-9].npz")):
+    for path in sorted(folder.rglob("*[0-9].npz")):
         with np.load(path) as stored:
             found.append(SceneMaps(*(torch.from_numpy(stored[name]) for name in SceneMaps._fields)))
     return found

@@ -4,6 +4,13 @@ import numpy as np
 import torch
 from scipy import stats
 
+# settings of CaptureConfig
+FAULTLESS = {
+    "light_direction_error_share": 0.0,
+    "light_intensity_error_share": 0.0,
+    "saturated_share": 0.0,
+    "sensor_noise": False,
+}
 N = 20_000
 # Four standard deviations of a share of 20 000.
 SHARE = 0.015

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
-from scenes import bumps, cap_directions, parametrize, sphere
+from scenes import bumps, cap_directions, parametrize, shade, sphere
 from splinecli.estimate.light_descent import best_lights
 from splinecli.lights.least_curl import (
     Lights,
@@ -48,9 +48,7 @@ def test_the_network_expects_smaller_errors_under_lights_nearer_to_the_true_ones
     """A glossy ball, and lights with errors of their own and one in common."""
     normals, mask = sphere(SIZE)
     true = cap_directions(10, 50, 4, even=True)
-    half = unit(true + np.array((0, 0, 1)))
-    shading = (normals[mask] @ true.T).clip(0)
-    images = shading + 0.4 * shading**0.1 * (normals[mask] @ half.T).clip(0) ** 60
+    images = shade(normals[mask], true, gloss=0.4, exponent=60)
     rng = default_rng(1)
     start = unit(true @ Rotation.from_euler("x", 8, degrees=True).as_matrix().T)
     start = unit(start + 0.06 * rng.normal(size=start.shape))

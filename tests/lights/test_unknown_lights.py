@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from scenes import (
     assert_unit,
     cap_directions,
+    halfway,
     parametrize,
     refuses,
     ring_lights,
@@ -122,8 +123,7 @@ def test_what_shows_no_object_is_refused():
 def test_a_ball_of_light_and_highlight_is_not_returned_as_a_hollow():
     """Its brightness is constant but for a wide highlight, as no trained material's is."""
     true = ring_lights(8, 50)
-    towards = unit(true + np.array((0, 0, 1)))
-    values = 0.05 + np.exp(20 * (NORMALS[INSIDE] @ towards.T - 1))
+    values = 0.05 + np.exp(20 * (NORMALS[INSIDE] @ halfway(true).T - 1))
     with refuses("bump or a hollow"):
         find_lights(values.astype(np.float32), INSIDE, False)
 

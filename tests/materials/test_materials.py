@@ -13,6 +13,7 @@ from scenes import (
     cap_directions,
     codes,
     decode_rgb,
+    halfway,
     parametrize,
     read_image,
     read_json,
@@ -30,7 +31,6 @@ from splinecli.lights.lighting import PixelLighting
 from splinecli.materials import maps
 from splinecli.materials.maps import render_gray
 from splinecli.materials.material_net import material_networks
-from splinecli.maths.normals import unit
 from splinecli.pipeline.evaluate import evaluate_captures
 from splinecli.pipeline.infer import infer_capture
 from splinecli.pipeline.infer_options import InferOptions
@@ -54,8 +54,8 @@ def ggx_sphere(lights, *, diffuse, f0, roughness):
     without Fresnel.
     """
     alpha = roughness**2
-    half = unit(lights + np.array((0, 0, 1.0)))
-    n_l, n_h, n_v = (NORMALS @ lights.T).clip(0), (NORMALS @ half.T).clip(0), NORMALS[:, 2:]
+    n_l, n_h = ((NORMALS @ each.T).clip(0) for each in (lights, halfway(lights)))
+    n_v = NORMALS[:, 2:]
     facets = alpha**2 / (np.pi * (n_h**2 * (alpha**2 - 1) + 1) ** 2)
 
     def masking(cosine):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scenes import cap_directions, sphere
+from scenes import cap_directions, shade, sphere
 from splinecli.capture.arrays import open_arrays
 from splinecli.estimate.light_descent import LightWitness
 from splinecli.maths.normals import angle_between_deg, unit
@@ -18,12 +18,8 @@ def ball():
     """Return images (F, H, W) of a glossy ball, its mask and its lights."""
     normals, mask = sphere(48)
     lights = cap_directions(12, 55, 4, even=True)
-    half = unit(lights + np.array((0, 0, 1)))
-    images = np.zeros((12, *mask.shape))
-    shading = (normals[mask] @ lights.T).clip(0)
-    gloss = (normals[mask] @ half.T).clip(0) ** 60
-    images[:, mask] = (0.6 * shading + 0.3 * (shading > 0) * gloss).T
-    return images, mask, lights
+    shaded = 0.6 * shade(normals, lights, gloss=0.5, exponent=60) * mask[..., None]
+    return np.moveaxis(shaded, 2, 0), mask, lights
 
 
 def judged(ball, given, options=OPTIONS):

@@ -16,7 +16,7 @@ import tifffile
 import torch
 
 from html_page import REPORT, SIDE, HtmlPage, ball, light_at
-from scenes import decode_rgb, parametrize, square_grid, write_image
+from scenes import decode_rgb, halfway, parametrize, square_grid, write_image
 from splinecli.evaluation.document import html_report
 from splinecli.evaluation.protocol import Evaluation, Protocol, Result
 from splinecli.materials.lobes import GGX, Geometry, diffuse_lobe, facet_lobe
@@ -217,11 +217,7 @@ def test_a_glossy_sphere_of_two_colours(open_page):
     albedo = albedo[:, None].repeat(SIDE, 1).reshape(SIDE, SIDE, 3) * mask[..., None]
     gain, shininess, light = 0.2, 64, light_at(-0.5, 0.4)
     cosine = np.maximum(normals @ light, 0)[..., None]
-    lobe = (
-        (shininess + 8)
-        / 8
-        * np.maximum(normals @ unit(light + np.array((0, 0, 1))), 0)[..., None] ** shininess
-    )
+    lobe = (shininess + 8) / 8 * glossy(normals, light, shininess)[..., None]
     stored = decode_transfer(np.float32(albedo_picture(albedo, mask)) / 255, None)
 
     html = result_page(REPORT, normals, mask, values={"albedo": albedo})
@@ -234,7 +230,7 @@ def test_a_glossy_sphere_of_two_colours(open_page):
 
 
 def glossy(n, light, exponent):
-    return np.maximum(n @ unit(light + np.array((0, 0, 1))), 0) ** exponent
+    return np.maximum(n @ halfway(light), 0) ** exponent
 
 
 @parametrize("webgl", [True, False])

@@ -9,7 +9,7 @@ import torch
 from pytest import approx
 from torch.testing import assert_close
 
-from distributions import seeded
+from distributions import FAULTLESS, seeded
 from scenes import parametrize
 from splinecli.maths.observation_map import cell_directions
 from splinecli.workshop.pixel_sets.source import (
@@ -19,20 +19,10 @@ from splinecli.workshop.pixel_sets.source import (
 )
 from splinecli.workshop.synthesis.batches import CaptureConfig
 
-FAULTLESS = CaptureConfig(
-    min_lights=5,
-    max_lights=10,
-    usual_lights=8,
-    light_direction_error_share=0.0,
-    light_intensity_error_share=0.0,
-    saturated_share=0.0,
-    sensor_noise=False,
-    eight_bit_share=0.0,
-    ambient_share=0.0,
-)
+PLAIN = CaptureConfig(**FAULTLESS, min_lights=5, max_lights=10, usual_lights=8, ambient_share=0.0)
 
 
-def source_of(pixel_set, config=FAULTLESS, seed=0):
+def source_of(pixel_set, config=PLAIN, seed=0):
     return PixelSetSource(pixel_set, pixel_set.entries, config, seeded(seed))
 
 
@@ -80,7 +70,7 @@ def test_all_pixels_have_the_same_probability(make_set):
 
 def test_a_set_with_fewer_lights_than_asked_for_gives_all_it_has(make_set):
     pixel_set = make_set(entries=[("a", "one", 20, 6), ("b", "two", 20, 12)])
-    config = replace(FAULTLESS, min_lights=20, max_lights=20, usual_lights=20)
+    config = replace(PLAIN, min_lights=20, max_lights=20, usual_lights=20)
     batch = source_of(pixel_set, config).draw(100)
     assert set(batch.valid.sum(dim=1).tolist()) == {6, 12}
     few = batch.valid.sum(dim=1) == 6
@@ -90,7 +80,7 @@ def test_a_set_with_fewer_lights_than_asked_for_gives_all_it_has(make_set):
 
 def test_pixels_of_a_capture_are_of_one_entry_under_the_same_lights(make_set):
     pixel_set = make_set()
-    source = source_of(pixel_set, replace(FAULTLESS, capture_pixels=10))
+    source = source_of(pixel_set, replace(PLAIN, capture_pixels=10))
     names = {
         n.tobytes(): entry.name
         for entry in pixel_set.entries

@@ -8,7 +8,7 @@ from pytest import approx
 from scipy import stats
 from torch.testing import assert_close
 
-from distributions import seeded
+from distributions import FAULTLESS, seeded
 from scenes import parametrize
 from splinecli.maths.observation_map import cell_directions
 from splinecli.workshop.synthesis.pixels import (
@@ -18,12 +18,7 @@ from splinecli.workshop.synthesis.pixels import (
     draw_visible_normals,
 )
 
-PLAIN = PixelGeneratorConfig(
-    light_direction_error_share=0.0,
-    light_intensity_error_share=0.0,
-    saturated_share=0.0,
-    sensor_noise=False,
-)
+PLAIN = PixelGeneratorConfig(**FAULTLESS)
 SHARES = "wall_share second_wall_share ambient_share mixed_share translucent_share"
 NOTHING = replace(PLAIN, **dict.fromkeys(SHARES.split(), 0.0))
 

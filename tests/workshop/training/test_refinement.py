@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from distributions import seeded
+from distributions import FAULTLESS, seeded
 from scenes import refuses
 from splinecli.errors import ModelError, UsageError
 from splinecli.estimate.networks.refine_net import FEATURE_CHANNELS, channels
@@ -32,14 +32,7 @@ from splinecli.workshop.training.refinement import (
 from splinecli.workshop.training.tasks import RefinementTask
 
 CPU = torch.device("cpu")
-FLAWLESS = CaptureConfig(
-    light_direction_error_share=0.0,
-    light_intensity_error_share=0.0,
-    unequal_lights_share=0.0,
-    saturated_share=0.0,
-    sensor_noise=False,
-    ambient_share=0.0,
-)
+PLAIN = CaptureConfig(**FAULTLESS, unequal_lights_share=0.0, ambient_share=0.0)
 
 
 def scene(pixels=300, lights=8):
@@ -52,7 +45,7 @@ def scene(pixels=300, lights=8):
 def test_ambient_light_is_the_same_in_all_images_of_a_capture():
     """It is between a share of the pixel's mean and of the capture's mean."""
     radiance, directions = scene()
-    config = replace(FLAWLESS, ambient_share=1.0)
+    config = replace(PLAIN, ambient_share=1.0)
     observations, _, exposure, _ = photograph_scene(radiance, directions, config, seeded(4))
     added = torch.where(observations < 1, observations / exposure - radiance, torch.nan)
     assert added.nan_to_num(0).amax(1).sub(added.nan_to_num(9).amin(1)).max() < 1e-5
@@ -66,7 +59,7 @@ def test_ambient_light_is_the_same_in_all_images_of_a_capture():
 def test_errors_of_calibration_are_those_of_the_capture():
     """Every pixel has the same factor under one light."""
     radiance, directions = scene()
-    config = replace(FLAWLESS, light_intensity_error_share=1.0, unequal_lights_share=1.0)
+    config = replace(PLAIN, light_intensity_error_share=1.0, unequal_lights_share=1.0)
     observations, *_ = photograph_scene(radiance, directions, config, seeded(1))
     factors = torch.where(radiance < 0.9, observations / radiance, torch.nan)
     spread = factors.nan_to_num(0).amax(0) - factors.nan_to_num(9).amin(0)
@@ -82,7 +75,7 @@ def test_saturated_captures_are_restored():
     _, directions = scene(lights=12)
     normals = normalize(torch.rand(400, 3, generator=generator) + 0.3, dim=1)
     radiance = normals @ directions.T * torch.rand(400, 1, generator=generator)
-    config = replace(FLAWLESS, saturated_share=1.0)
+    config = replace(PLAIN, saturated_share=1.0)
     observations, *_ = photograph_scene(radiance, directions, config, seeded(2))
     assert observations.max() > 1.02
     ratio = observations / radiance
