@@ -16,6 +16,7 @@ from scenes import parametrize, read_json
 from splinecli import __version__
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
+from splinecli.estimate.networks.weights import load_weights
 from splinecli.judge.judge_net import CLASSES, JudgeNet
 from splinecli.workshop.save_weights import save_weights
 
@@ -160,6 +161,26 @@ def test_all_figures(run, tmp_path):
     assert list(measured["rows"]["ls"]) == ["0", "2", "4", "8"]
     assert measured["rows"]["ls"]["0"] < measured["rows"]["ls"]["8"]
     assert run(f"{command} --trials 2 --only noise/ls") == ""
+
+
+def test_refinement_pilots(run, make_set, tmp_path):
+    """Captures are drawn once, and a larger net starts from the shipped ones."""
+    make_set()
+    captures, unseen, pilot = (tmp_path / name for name in ("captures", "unseen", "pilot"))
+    for folder, seed in ((captures, 0), (unseen, 1)):
+        drawn = run(f"refinement_pilots draw {folder} {tmp_path}/set --count 2 --seed {seed}")
+        assert drawn.split()[:3] == ["0", "1", "2"]
+    assert run(f"refinement_pilots draw {unseen} {tmp_path}/set --count 2").startswith("2 captures")
+    start = tmp_path / "start.safetensors"
+    run(f"refinement_pilots join spline-net spline-net {start}")
+    command = f"refinement_pilots train {captures} {unseen} {pilot} --start {start}"
+    run(f"{command} --variant blur --core-seconds 0.1")
+    trained, shipped = (
+        load_weights(path).network for path in (pilot / "weights.safetensors", start)
+    )
+    assert trained.config.refine_reads_blur and not shipped.config.refine_reads_blur
+    _, steps, before, after, *_ = numbers(run(f"refinement_pilots report {pilot}"))
+    assert steps >= 1 and after == approx(before, abs=0.2)
 
 
 def test_wrong_lights(run):
