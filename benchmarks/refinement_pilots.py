@@ -126,6 +126,7 @@ def train(
     run: Path,
     variant: str,
     start: str,
+    seed: int,
     core_seconds: float,
     edge_weight: float,
 ) -> None:
@@ -176,7 +177,7 @@ def train(
         share = min(1.0, 0.5 + 1.5 * progress)
         pool.examples.clear()
         pool.examples.extend(training[: max(CAPTURES_PER_STEP, round(share * len(training)))])
-        generator = torch.Generator().manual_seed(stream_seed(0, step))
+        generator = torch.Generator().manual_seed(stream_seed(seed, step))
         network.train()
         maps = pool.draw(CAPTURES_PER_STEP, generator)
         losses = refinement_losses(
@@ -238,6 +239,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         training.add_argument(name, type=Path)
     training.add_argument("--variant", choices=VARIANTS, default="today")
     training.add_argument("--start", default="spline-net")
+    training.add_argument("--seed", type=int, default=0)
     training.add_argument("--core-seconds", type=float, default=7200)
     training.add_argument("--edge-weight", type=float, default=0.0)
     joining = commands.add_parser("join")
