@@ -84,12 +84,20 @@ def join(pixelwise: Path, refined: str, start: Path) -> None:
     refinement nets of others.
     """
     network = resolve_weights(refined).network
-    network.load_state_dict(resolve_weights(str(pixelwise)).network.state_dict(), strict=False)
+    parts = (resolve_weights(str(pixelwise)).network, False), (network, True)
+    network.load_state_dict(
+        {
+            name: values
+            for part, refines in parts
+            for name, values in part.state_dict().items()
+            if name.startswith("refine_net.") == refines
+        }
+    )
     save_weights(network, start)
 
 
 def load(folder: Path) -> list[SceneMaps]:
-    """Return the stored captures."""
+    """Return the captures in a folder and its subfolders."""
     found = []
     for path in sorted(folder.rglob("*[0-9].npz")):
         with np.load(path) as stored:

@@ -381,8 +381,8 @@ class Exposure(NamedTuple):
 def find_exposure(facts: ImageHeader) -> Exposure | None:
     """Return the exposure of an image, or None if the file is damaged or states no exposure time.
 
-    Values outside the range of real cameras count as missing. For example, manual lenses state no
-    f-number or zero.
+    Values outside the range of real cameras are treated as missing. For example, the f-number of a
+    manual lens is missing or zero.
     """
     try:
         if facts.exif is None and facts.kind == "RAW":

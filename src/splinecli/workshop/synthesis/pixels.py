@@ -263,7 +263,8 @@ def draw_flat_normals(pixels: int, captures: int, generator: torch.Generator) ->
     tilt = torch.cat((azimuth.cos(), azimuth.sin()), dim=1) * slope
     sigma = 10 ** uniform(low=-1.7, high=-0.4)
     detail = torch.randn(pixels, 2, generator=generator, device=generator.device)
-    slopes = tilt.repeat(pixels // captures, 1) + sigma.repeat(pixels // captures, 1) * detail
+    own = torch.cat((tilt, sigma), dim=1).repeat(pixels // captures, 1)
+    slopes = own[:, :2] + own[:, 2:] * detail
     upright = torch.nn.functional.pad(slopes, (0, 1), value=1.0)
     return torch.nn.functional.normalize(upright, dim=1)
 
