@@ -171,8 +171,9 @@ def train_steps(
     from splinecli.workshop.training.config import configure
     from splinecli.workshop.training.loop import Trainer
 
-    tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES = size.captures, 1  # type: ignore[attr-defined]
-    config, place = configure(preset, None, list(changes)), choose_device(device)
+    tasks.VALIDATION_SCENES = 1
+    changes = [*changes, {"first_captures": size.captures}]
+    config, place = configure(preset, None, changes), choose_device(device)
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(config, Path(folder), place)
         if same_batches and isinstance(trainer.task, tasks.PixelTask):
@@ -187,7 +188,7 @@ def train_steps(
         if isinstance(trainer.task, tasks.RefinementTask):
             started = time.perf_counter()
             for _ in range(3):
-                trainer.task.pool.add()
+                trainer.task.captures.add()
             found["capture_seconds"] = (time.perf_counter() - started) / 3
     found["steps_per_second"] = 1 / statistics.mean(seconds[1:])  # the first step loads CUDA
     found["median_step_seconds"] = statistics.median(seconds[1:])
@@ -228,18 +229,19 @@ def train(pixel_set: str, run: str, device: str, ends: float, capture_seconds: f
     """
     from splinecli.cli.console import Messages
     from splinecli.workshop.training import tasks
-    from splinecli.workshop.training.config import configure
+    from splinecli.workshop.training.config import PRESETS, configure
     from splinecli.workshop.training.loop import open_run
 
     def minutes_left() -> float:
         return max(0.05, (ends - SPARE_SECONDS - time.time()) / 60)
 
-    usual, held = tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES  # type: ignore[attr-defined]
+    usual, held = PRESETS["refine"].first_captures, tasks.VALIDATION_SCENES
     share = min(1.0, 60 * minutes_left() / 2 / (capture_seconds * (usual + held)))
-    tasks.FIRST_EXAMPLES, tasks.VALIDATION_SCENES = (  # type: ignore[attr-defined]
+    first, tasks.VALIDATION_SCENES = (
         max(1, round(share * number)) for number in (usual, held)
     )
-    config = configure("refine", None, [{"sources": {pixel_set: 1.0}, "minutes": minutes_left()}])
+    changes = {"sources": {pixel_set: 1.0}, "minutes": minutes_left(), "first_captures": first}
+    config = configure("refine", None, [changes])
     with open_run(
         config, Path(run), device, resume=False, tensorboard=False, observer=Messages(quiet=False)
     ) as trainer:
@@ -247,7 +249,7 @@ def train(pixel_set: str, run: str, device: str, ends: float, capture_seconds: f
         trainer.config = dataclasses.replace(config, minutes=minutes_left())
         last = trainer.run()
     assert last is not None
-    found = {"first_captures": tasks.FIRST_EXAMPLES, "training_minutes": trainer.config.minutes}  # type: ignore[attr-defined]
+    found = {"first_captures": first, "training_minutes": trainer.config.minutes}
     return {**found, **dataclasses.asdict(last), "peak_gpu_mib": peak_gpu_mib()}
 
 

@@ -69,17 +69,8 @@ run "optics${4:-}" "$folder/random" "$folder/views" --preset refine --start-from
   --param learning_rate=1e-4 --param pixels.optics_share=0.5
 
 # The mean of start and end is better on unseen scenes than either of them.
-"$python" - "$start" "$folder/optics${4:-}/weights.safetensors" "$folder/weights.safetensors" <<'END'
-import sys
-from pathlib import Path
-from splinecli.estimate.networks.weights import load_weights
-from splinecli.workshop.save_weights import save_weights
-
-network, other = (load_weights(Path(name)).network for name in sys.argv[1:3])
-parameters = other.state_dict()
-network.load_state_dict({name: (value + parameters[name]) / 2 for name, value in network.state_dict().items()})
-save_weights(network, Path(sys.argv[3]))
-END
+"$python" "$(dirname "$0")/../benchmarks/combine_weights.py" mean "$folder/weights.safetensors" "$start" \
+  "$folder/optics${4:-}/weights.safetensors"
 echo "$folder/weights.safetensors"
 
 # The material net reads the tokens of the spline-net in the package, so put the new weights there first. These

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from pytest import approx
 from safetensors.numpy import load_file
 
@@ -16,7 +17,7 @@ from scenes import parametrize, read_json
 from splinecli import __version__
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
-from splinecli.estimate.networks.weights import load_weights
+from splinecli.estimate.networks.weights import load_weights, resolve_weights
 from splinecli.judge.judge_net import CLASSES, JudgeNet
 from splinecli.workshop.save_weights import save_weights
 
@@ -163,24 +164,26 @@ def test_all_figures(run, tmp_path):
     assert run(f"{command} --trials 2 --only noise/ls") == ""
 
 
-def test_refinement_pilots(run, make_set, tmp_path):
-    """Captures are drawn once, and a larger net starts from the shipped ones."""
+def test_weights_are_combined_and_compared(run, make_set, tmp_path):
     make_set()
-    captures, unseen, pilot = (tmp_path / name for name in ("captures", "unseen", "pilot"))
-    for folder, seed in ((captures, 0), (unseen, 1)):
-        drawn = run(f"refinement_pilots draw {folder} {tmp_path}/set --count 2 --seed {seed}")
-        assert drawn.split()[:3] == ["0", "1", "2"]
-    assert run(f"refinement_pilots draw {unseen} {tmp_path}/set --count 2").startswith("2 captures")
-    start = tmp_path / "start.safetensors"
-    run(f"refinement_pilots join spline-net spline-net {start}")
-    command = f"refinement_pilots train {captures} {unseen} {pilot} --start {start}"
-    run(f"{command} --variant blur --core-seconds 0.1")
-    trained, shipped = (
-        load_weights(path).network for path in (pilot / "weights.safetensors", start)
-    )
-    assert trained.config.refine_reads_blur and not shipped.config.refine_reads_blur
-    _, steps, before, after, *_ = numbers(run(f"refinement_pilots report {pilot}"))
-    assert steps >= 1 and after == approx(before, abs=0.2)
+    other, joined, mean = (tmp_path / f"{name}.safetensors" for name in ("other", "joined", "mean"))
+    network = resolve_weights("spline-net").network
+    shipped = {name: values.clone() for name, values in network.state_dict().items()}
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter += 0.5
+    save_weights(network, other)
+    run(f"combine_weights join {other} spline-net {joined}")
+    run(f"combine_weights mean {mean} {joined} spline-net")
+    found, between = (load_weights(path).network.state_dict() for path in (joined, mean))
+    for name in shipped.keys() - {"cells"}:
+        added = 0.5 * (not name.startswith("refine_net."))
+        assert torch.allclose(found[name], shipped[name] + added, atol=1e-2), name
+        assert torch.allclose(between[name], shipped[name] + added / 2, atol=1e-2), name
+    command = f"unseen_scenes {tmp_path}/set --captures 2 --weights"
+    rows = [numbers(line) for line in run(f"{command} spline-net {joined}").splitlines()]
+    errors, changes = zip(*[(row[0], row[2]) for row in rows if len(row) == 4], strict=True)
+    assert changes[:2] == (0, 0) and min(changes[2:]) > 50 and 0 < errors[0] < 60
 
 
 def test_wrong_lights(run):

@@ -23,13 +23,13 @@ from splinecli.workshop.training import WEIGHTS, refinement, tasks
 from splinecli.workshop.training.config import PRESETS
 from splinecli.workshop.training.loop import Trainer
 from splinecli.workshop.training.refinement import (
-    STEPS_PER_EXAMPLE,
+    STEPS_PER_CAPTURE,
+    CaptureFolder,
     SceneMaps,
     ScenePool,
     refinement_losses,
     stack_maps,
 )
-from splinecli.workshop.training.tasks import RefinementTask
 
 CPU = torch.device("cpu")
 PLAIN = CaptureConfig(**FAULTLESS, unequal_lights_share=0.0, ambient_share=0.0)
@@ -108,8 +108,7 @@ def bumpy_set(tmp_path):
 
 @pytest.fixture
 def refining(tiny, bumpy_set, monkeypatch):
-    for name, value in (("FIRST_EXAMPLES", 3), ("VALIDATION_SCENES", 2)):
-        monkeypatch.setattr(tasks, name, value)
+    monkeypatch.setattr(tasks, "VALIDATION_SCENES", 2)
     monkeypatch.setattr(refinement, "ENGRAVED_SHARE", 0.0)
     monkeypatch.setattr(refinement, "BACKGROUND_SHARE", 0.0)
     monkeypatch.setattr(refinement, "ENLARGED_SHARE", 0.0)  # interpolated noise looks blurred
@@ -119,6 +118,7 @@ def refining(tiny, bumpy_set, monkeypatch):
         sources={str(bumpy_set.folder): 1.0},
         pixels=replace(tiny.pixels, optics_share=0.0),
         updates="refine_net",
+        first_captures=3,
         batch_size=2,
         shards=1,
         steps=90,
@@ -180,44 +180,55 @@ def network_of(config):
     return SplineNet(config.network)
 
 
-def test_captures_of_a_pool(refining, bumpy_set):
-    network = network_of(refining)
+def pool_of(bumpy_set, refining, seed, **changes):
     scenes = [(bumpy_set, bumpy_set.entries, 1.0)]
+    return ScenePool(scenes, network_of(refining), replace(refining.pixels, **changes), seed)
 
-    def pool(seed):
-        made = ScenePool(scenes, network, refining.pixels, seed)
-        made.add()
-        return made
 
-    one, again, other = pool(1).examples[0], pool(1).examples[0], pool(2).examples[0]
+def test_captures_of_a_pool(refining, bumpy_set, tmp_path):
+    pool = pool_of(bumpy_set, refining, 1)
+    one, again = (pool_of(bumpy_set, refining, 1).photograph(0) for _ in range(2))
+    other = pool_of(bumpy_set, refining, 2)
     assert one.features.shape == (FEATURE_CHANNELS, 26, 26), "with the dark margin"
     assert torch.equal(one.features, again.features)
-    assert not torch.equal(one.features, other.features)
-    drawn = pool(1).draw(3, seeded(0))
+    assert not torch.equal(one.features, other.photograph(0).features)
+    assert pool.sha256() == pool_of(bumpy_set, refining, 1).sha256() != other.sha256()
+    captures = CaptureFolder(pool, tmp_path)
+    captures.fill(1, 1)
+    drawn = captures.draw(3, seeded(0))
     # A turn changes no angle between estimate and truth, and so no loss before refinement.
     assert drawn.normals.shape == (3, 3, 26, 26)
+    network = network_of(refining)
     straight = refinement_losses(network, stack_maps([one])).before
     assert_close(refinement_losses(network, drawn).before, straight, atol=1e-3, rtol=1e-3)
 
 
-def test_a_run_that_continues_has_the_newest_captures(refining, bumpy_set, monkeypatch):
-    """It began with the oldest ones again."""
-    monkeypatch.setattr(tasks, "FIRST_EXAMPLES", 2)
-    monkeypatch.setattr(tasks, "VALIDATION_SCENES", 0)
-    network = network_of(refining)
-    config = replace(refining, sources={str(bumpy_set.folder): 1.0})
-    whole, rest = (RefinementTask(config, range(config.shards), CPU) for _ in range(2))
-    whole.prepare(network, rank=0, step=0)
-    next_step = STEPS_PER_EXAMPLE + 1
-    for step in range(next_step):
-        list(whole.losses(network, step, bfloat16=False))
-    rest.prepare(network, rank=0, step=next_step)
-    newest = list(whole.pool.examples)[-2:]
-    for one, other in zip(newest, rest.pool.examples, strict=True):
-        assert_close(tuple(one), tuple(other), rtol=0, atol=0)
-    for task in (whole, rest):
-        task.pool.add()
-    assert torch.equal(whole.pool.examples[-1].features, rest.pool.examples[-1].features)
+def test_the_newest_captures_are_kept(refining, bumpy_set, tmp_path, monkeypatch):
+    monkeypatch.setattr(refinement, "MOST_CAPTURES", 3)
+    captures, other = (CaptureFolder(pool_of(bumpy_set, refining, 1), tmp_path) for _ in range(2))
+    captures.fill(2, 2)
+    for _ in range(2):
+        captures.add()
+    assert captures.numbers == [1, 2, 3]
+    assert [int(path.stem) for path in sorted(captures.folder.iterdir())] == [1, 2, 3]
+    other.fill(2, 4)
+    assert other.numbers == [1, 2, 3], "as stored"
+    captures.folder.rename(tmp_path / "lost")
+    other.fill(2, 4)
+    assert other.numbers == [2, 3], "photographed again"
+    for path in other.folder.iterdir():
+        assert path.read_bytes() == (tmp_path / "lost" / path.name).read_bytes()
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_a_run_that_continues_ends_as_without_the_interruption(refining, tmp_path):
+    """It began with the newest captures alone."""
+    whole, rest = (tmp_path / name / WEIGHTS for name in ("whole", "rest"))
+    refining, steps = replace(refining, schedule="stepped"), 2 * STEPS_PER_CAPTURE + 1
+    Trainer(replace(refining, steps=steps), whole.parent, CPU).run()
+    Trainer(replace(refining, steps=STEPS_PER_CAPTURE + 1), rest.parent, CPU).run()
+    Trainer(replace(refining, steps=steps), rest.parent, CPU, resume=True).run()
+    assert whole.read_bytes() == rest.read_bytes()
 
 
 def test_generated_pixels_are_no_scenes(refining, tmp_path):
@@ -281,10 +292,7 @@ def test_pixels_at_edges_count_more(refining):
 
 
 def test_the_removed_blur_is_an_input(refining, bumpy_set):
-    network = network_of(refining)
-    config = replace(refining.pixels, optics_share=1.0)
-    pool = ScenePool([(bumpy_set, bumpy_set.entries, 1.0)], network, config, 3)
-    for _ in range(12):
-        pool.add()
-    blurs = [float(example.features[channels("removed_blur")].max()) for example in pool.examples]
+    pool = pool_of(bumpy_set, refining, 3, optics_share=1.0)
+    captures = map(pool.photograph, range(12))
+    blurs = [float(capture.features[channels("removed_blur")].max()) for capture in captures]
     assert min(blurs) == 0 and max(blurs) > 0.4, "the least that is removed"

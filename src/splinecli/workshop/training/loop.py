@@ -288,7 +288,7 @@ class Trainer:
             )
         if self.workers.leads and self.task.long_start:
             observer.say(self.task.long_start)
-        self.task.prepare(self.network, rank=self.workers.rank, step=self.counters.step)
+        self.task.prepare(self.network, folder, rank=self.workers.rank, step=self.counters.step)
         if self.workers.leads:
             self.log = RunLog(folder, self.counters.step, tensorboard=tensorboard)
             write_text(folder / CONFIG, json.dumps(config.to_dict(), indent=2) + "\n")

@@ -4,12 +4,16 @@ weights.
 
 from __future__ import annotations
 
-from collections import deque
+import hashlib
+import json
 from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from safetensors.torch import load_file, save
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -28,7 +32,9 @@ from splinecli.estimate.refinement.features import (
 )
 from splinecli.images.lens_blur import REACH
 from splinecli.lights.lighting import IndirectLight, PixelIndices, PixelLighting, parts_of_pixels
+from splinecli.system.files import write_bytes
 from splinecli.system.machine import choose_precision
+from splinecli.system.weight_files import tensors_sha256
 from splinecli.workshop.pixel_sets.store import Entry, PixelSet
 from splinecli.workshop.synthesis import stream_seed
 from splinecli.workshop.synthesis.batches import CaptureConfig
@@ -41,12 +47,8 @@ from splinecli.workshop.synthesis.whole_capture import (
 )
 from splinecli.workshop.training.objective import angles, balanced, error_negative_log_likelihood
 
-# Captures simulated before the first step. With 64, the net memorised them and was worse on others
-# for half an hour.
-FIRST_EXAMPLES = 160
-# after which another capture is simulated: about half of the training time on a CPU
-STEPS_PER_EXAMPLE = 6
-MOST_EXAMPLES = 2000  # of about a megabyte each; later ones replace the oldest
+STEPS_PER_CAPTURE = 6  # after which another capture is photographed
+MOST_CAPTURES = 6000  # of about 1.5 MB each; later ones replace the oldest
 # Shares of the scene captures that are enlarged, and of all captures with a background and of
 # engraved pieces.
 ENLARGED_SHARE, BACKGROUND_SHARE, ENGRAVED_SHARE = 0.3, 0.35, 0.4
@@ -73,11 +75,10 @@ class Scene(NamedTuple):
 
 
 class ScenePool:
-    """Captures of scenes, each with its own lights and faults. The pool grows during training.
+    """Scenes to be photographed, each time with other lights and faults.
 
     A capture depends only on (seed, its number). The scenes are pixel sets with selected entries,
     and the weight of each set; the network has an error head and is on the device of the captures.
-    A resumed run starts with its newest captures, of which `first` is the number of the first.
     """
 
     def __init__(
@@ -86,21 +87,30 @@ class ScenePool:
         network: SplineNet,
         config: CaptureConfig,
         seed: int,
-        *,
-        first: int = 0,
     ) -> None:
         self.scenes = tuple(scenes)
         self.network = network
         self.config = config
         self.seed = seed
-        self.examples: deque[SceneMaps] = deque(maxlen=MOST_EXAMPLES)
-        self._made = first
 
-    def add(self) -> None:
-        """Photograph another scene. Beyond MOST_EXAMPLES it replaces the oldest capture."""
-        generator = torch.Generator().manual_seed(stream_seed(self.seed, self._made))
-        self.examples.append(self._after_network(*self.draw_scene(generator), generator))
-        self._made += 1
+    def photograph(self, number: int) -> SceneMaps:
+        """Return a capture of another scene for each number."""
+        generator = torch.Generator().manual_seed(stream_seed(self.seed, number))
+        return self._after_network(*self.draw_scene(generator), generator)
+
+    def sha256(self) -> str:
+        """Return a checksum of everything that the captures depend on."""
+        pixelwise = {
+            name: values.cpu()
+            for name, values in self.network.state_dict().items()
+            if not name.startswith("refine_net.")
+        }
+        scenes = [
+            (found.sha256, [entry.name for entry in entries], weight)
+            for found, entries, weight in self.scenes
+        ]
+        known = scenes, asdict(self.config), self.seed, tensors_sha256(pixelwise)
+        return hashlib.sha256(json.dumps(known).encode()).hexdigest()
 
     def draw_scene(
         self, generator: torch.Generator, engraved_share: float = ENGRAVED_SHARE
@@ -160,18 +170,51 @@ class ScenePool:
             mask,
             removed_blur=seen.removed_blur,
         )
-        return SceneMaps(_placed(features, mask).half(), _placed(truth, mask).half(), mask[None])
+        features, truth = _placed(features, mask), _placed(truth, mask)
+        return SceneMaps(features.half(), truth.half(), mask[None].contiguous())
+
+
+class CaptureFolder:
+    """The captures of a run, as files, so that a run that continues has the captures that it had.
+
+    They lie in a folder of their own for each pool, `folder`/CHECKSUM.
+    """
+
+    def __init__(self, pool: ScenePool, folder: Path) -> None:
+        self.pool = pool
+        self.folder = folder / pool.sha256()[:16]
+        self.numbers: list[int] = []
+
+    def fill(self, first: int, count: int) -> None:
+        """Prepare for the step after which the pool had photographed `count` captures.
+
+        Captures from number `count - first` on are photographed if they are not stored.
+        """
+        self.numbers = [
+            number
+            for number in range(max(0, count - MOST_CAPTURES), count)
+            if number >= count - first or self._path(number).exists()
+        ]
+        for number in self.numbers:
+            self._make(number)
+
+    def add(self) -> None:
+        """Photograph another scene. Beyond MOST_CAPTURES it replaces the oldest capture. Raises
+        OutputError.
+        """
+        self.numbers.append(self.numbers[-1] + 1)
+        self._make(self.numbers[-1])
+        if len(self.numbers) > MOST_CAPTURES:
+            self._path(self.numbers.pop(0)).unlink(missing_ok=True)
 
     def draw(self, count: int, generator: torch.Generator) -> SceneMaps:
         """Draw `count` captures, rotate and mirror each, and return them stacked as float32 (count,
         ...).
         """
         drawn = []
-        for index in torch.randint(
-            len(self.examples), (count,), generator=generator, device=generator.device
-        ):
-            example = self.examples[int(index)]
-            draw = torch.rand(3, generator=generator, device=generator.device).tolist()
+        for index in torch.randint(len(self.numbers), (count,), generator=generator).tolist():
+            example = SceneMaps(**load_file(self._path(self.numbers[index])))
+            draw = torch.rand(3, generator=generator).tolist()
             turn = MapTurn(int(4 * draw[0]), draw[1] < 0.5)
             features = turn_features(example.features, turn).clone()
             if draw[2] < 0.5:
@@ -179,6 +222,14 @@ class ScenePool:
             normals = turn_maps(example.normals, turn, vectors=((0, 1),))
             drawn.append(SceneMaps(features, normals, turn_maps(example.mask, turn)))
         return stack_maps(drawn)
+
+    def _path(self, number: int) -> Path:
+        return self.folder / f"{number:06}.safetensors"
+
+    def _make(self, number: int) -> None:
+        if not self._path(number).exists():
+            content = save(self.pool.photograph(number)._asdict())
+            write_bytes(self._path(number), content)
 
 
 def _placed(values: Tensor, mask: Tensor) -> Tensor:

@@ -24,6 +24,7 @@ from splinecli.workshop.pixel_sets.store import Entry, PixelSet, open_pixel_set
 from splinecli.workshop.synthesis import stream_seed
 from splinecli.workshop.synthesis.batches import PixelBatch
 from splinecli.workshop.synthesis.pixels import PixelGenerator
+from splinecli.workshop.training import CAPTURES
 from splinecli.workshop.training.config import GENERATOR, TrainingConfig
 from splinecli.workshop.training.objective import (
     Losses,
@@ -35,8 +36,8 @@ from splinecli.workshop.training.objective import (
     to_pixel_frame,
 )
 from splinecli.workshop.training.refinement import (
-    FIRST_EXAMPLES,
-    STEPS_PER_EXAMPLE,
+    STEPS_PER_CAPTURE,
+    CaptureFolder,
     ScenePool,
     refinement_losses,
     stack_maps,
@@ -198,9 +199,9 @@ class PixelTask:
         self.source = pixel_source(config, self.sets.training, self.generator)
         self._held = pixel_source(config, self.sets.validation, held, validates=True)
 
-    def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
-        """Draw the data of process `rank` for the first step of this run, `step`. Only process 0
-        validates.
+    def prepare(self, network: SplineNet, folder: Path, *, rank: int, step: int) -> None:
+        """Draw the data of process `rank` for the first step of this run, `step`, in its folder.
+        Only process 0 validates.
         """
         if rank == 0:
             # At least 64 pixels at a time, because a draw has one source
@@ -300,7 +301,7 @@ def _estimate(
 
 
 class RefinementTask:
-    """Captures of whole scenes, simulated during training; see ScenePool."""
+    """Captures of whole scenes, photographed before and during training; see ScenePool."""
 
     long_start = "photographing the first captures, for some minutes"
 
@@ -320,32 +321,32 @@ class RefinementTask:
             )
         self.sets = open_sets(config)
 
-    def prepare(self, network: SplineNet, *, rank: int, step: int) -> None:
-        config = self.config
-        seed = stream_seed(config.seed, rank, _POOL_STREAM)
-        # number of the first capture, with one added before step 0 and so on
-        first = -(-step // STEPS_PER_EXAMPLE)
-        self.pool = self._pool(self.sets.training, network, seed, first=first)
-        for _ in range(FIRST_EXAMPLES):
-            self.pool.add()
+    def prepare(self, network: SplineNet, folder: Path, *, rank: int, step: int) -> None:
+        first = self.config.first_captures
+        pool = self._pool(
+            self.sets.training, network, stream_seed(self.config.seed, rank, _POOL_STREAM)
+        )
+        self.captures = CaptureFolder(pool, folder / CAPTURES)
+        # One is added before step 0 and so on.
+        self.captures.fill(first, first - (-step // STEPS_PER_CAPTURE))
         if rank == 0:
-            seed = stream_seed(config.seed, 0, _VALIDATION_STREAM)
+            seed = stream_seed(self.config.seed, 0, _VALIDATION_STREAM)
             held = self._pool(self.sets.validation, network, seed)
-            for _ in range(VALIDATION_SCENES):
-                held.add()
-            self.validation = [stack_maps([example]) for example in held.examples]
+            self.validation = [
+                stack_maps([held.photograph(number)]) for number in range(VALIDATION_SCENES)
+            ]
 
-    def _pool(self, scenes: Scenes, network: SplineNet, seed: int, *, first: int = 0) -> ScenePool:
+    def _pool(self, scenes: Scenes, network: SplineNet, seed: int) -> ScenePool:
         weighted = [(*scenes[name], self.config.sources[name]) for name in scenes]
-        return ScenePool(weighted, network, self.config.pixels, seed, first=first)
+        return ScenePool(weighted, network, self.config.pixels, seed)
 
     def losses(self, network: SplineNet, step: int, *, bfloat16: bool) -> Iterator[Losses]:
-        if step % STEPS_PER_EXAMPLE == 0:
-            self.pool.add()
+        if step % STEPS_PER_CAPTURE == 0:
+            self.captures.add()
         missing = torch.full((), torch.nan, device=self.device)
         for shard in self.shards:
             self.generator.manual_seed(stream_seed(self.config.seed, step, shard))
-            maps = self.pool.draw(self.config.batch_size // self.config.shards, self.generator)
+            maps = self.captures.draw(self.config.batch_size // self.config.shards, self.generator)
             with fixed(network, "refine_net"):
                 weights = {
                     name: getattr(self.config, name) for name in ("detail_weight", "edge_weight")

@@ -1,0 +1,67 @@
+"""Compare weights of spline-net on captures of rendered scenes that none of them was trained on.
+
+    python benchmarks/unseen_scenes.py SET... --weights OLD NEW...
+
+SET is a pixel set of `splinecli prepare`, such as unseen-groups of render_training_scenes.sh. A
+capture is a part of a scene, or an engraved piece, with the lights, faults and camera of training
+captures. The changes are relative to the first weights, with their standard errors over captures.
+"""
+
+import argparse
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from splinecli.estimate.networks.weights import resolve_weights
+from splinecli.maths import Floats
+from splinecli.workshop.pixel_sets.store import open_pixel_set
+from splinecli.workshop.training.config import PRESETS
+from splinecli.workshop.training.refinement import ScenePool, refinement_losses, stack_maps
+
+
+@torch.no_grad()
+def errors_deg(weights: str, pool: ScenePool, captures: range) -> Floats:
+    """Return the mean errors of captures, before and after refinement, (N, 2)."""
+    pool.network = resolve_weights(weights).network.eval()
+    found = []
+    for number in captures:
+        losses = refinement_losses(pool.network, stack_maps([pool.photograph(number)]))
+        found.append((math.degrees(losses.before), math.degrees(losses.angle)))
+        print(".", end="", flush=True)
+    print()
+    return np.array(found)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("sets", nargs="+", type=Path)
+    parser.add_argument("--weights", nargs="+", default=["spline-net"])
+    parser.add_argument("--captures", type=int, default=120)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args(arguments)
+    opened = [open_pixel_set(path) for path in options.sets]
+    scenes = [(found, found.entries, float(len(found.entries))) for found in opened]
+    first = None
+    for weights in options.weights:
+        pool = ScenePool(
+            scenes, resolve_weights(weights).network, PRESETS["refine"].pixels, options.seed
+        )
+        found = errors_deg(weights, pool, range(options.captures))
+        first = found if first is None else first
+        print(weights)
+        for stage, errors, before in zip(("pixelwise", "refined"), found.T, first.T, strict=True):
+            change = 100 * np.log(errors / before)
+            deviation = change.std() / math.sqrt(len(change))
+            print(
+                f"  {stage:9} {errors.mean():.3f} deg, median {np.median(errors):.3f},"
+                f" {change.mean():+.2f} % ({deviation:.2f})"
+            )
+
+
+if __name__ == "__main__":
+    main()
