@@ -1,11 +1,11 @@
 """Combine weights of spline-net.
 
     python benchmarks/combine_weights.py join PIXELWISE REFINED OUT
-    python benchmarks/combine_weights.py mean OUT WEIGHTS...
+    python benchmarks/combine_weights.py mean WEIGHTS... OUT
 
 `join` takes the pixelwise networks with their error head from one file and the refinement nets from
 another, which can then be trained further. `mean` averages the weights of runs with the same start,
-which is often more accurate on unseen scenes than either of them.
+which is often more accurate on unseen scenes than any of them.
 """
 
 import argparse
@@ -35,9 +35,11 @@ def join(pixelwise: str, refined: str, out: Path) -> None:
     save_weights(network, out)
 
 
-def mean(out: Path, weights: list[str]) -> None:
+def mean(weights: list[str], out: Path) -> None:
     """Write the means of all parameters."""
     networks = [resolve_weights(name).network for name in weights]
+    for name, network in zip(weights, networks, strict=True):
+        assert network.config == networks[0].config, f"{name} is of another network"
     parameters = [network.state_dict() for network in networks]
     networks[0].load_state_dict(
         {
@@ -58,8 +60,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     joining.add_argument("refined")
     joining.add_argument("out", type=Path)
     averaging = commands.add_parser("mean")
-    averaging.add_argument("out", type=Path)
     averaging.add_argument("weights", nargs="+")
+    averaging.add_argument("out", type=Path)
     options = vars(parser.parse_args(arguments))
     if options.pop("command") == "join":
         join(**options)

@@ -14,6 +14,7 @@ import dataclasses
 import json
 import os
 import platform
+import shutil
 import signal
 import statistics
 import sys
@@ -228,7 +229,7 @@ def train(pixel_set: str, run: str, device: str, ends: float, capture_seconds: f
     it at most.
     """
     from splinecli.cli.console import Messages
-    from splinecli.workshop.training import tasks
+    from splinecli.workshop.training import CAPTURES, tasks
     from splinecli.workshop.training.config import PRESETS, configure
     from splinecli.workshop.training.loop import open_run
 
@@ -237,9 +238,7 @@ def train(pixel_set: str, run: str, device: str, ends: float, capture_seconds: f
 
     usual, held = PRESETS["refine"].first_captures, tasks.VALIDATION_SCENES
     share = min(1.0, 60 * minutes_left() / 2 / (capture_seconds * (usual + held)))
-    first, tasks.VALIDATION_SCENES = (
-        max(1, round(share * number)) for number in (usual, held)
-    )
+    first, tasks.VALIDATION_SCENES = (max(1, round(share * number)) for number in (usual, held))
     changes = {"sources": {pixel_set: 1.0}, "minutes": minutes_left(), "first_captures": first}
     config = configure("refine", None, [changes])
     with open_run(
@@ -248,6 +247,7 @@ def train(pixel_set: str, run: str, device: str, ends: float, capture_seconds: f
         # How long photographing takes is known only now.
         trainer.config = dataclasses.replace(config, minutes=minutes_left())
         last = trainer.run()
+    shutil.rmtree(Path(run) / CAPTURES)
     assert last is not None
     found = {"first_captures": first, "training_minutes": trainer.config.minutes}
     return {**found, **dataclasses.asdict(last), "peak_gpu_mib": peak_gpu_mib()}

@@ -23,15 +23,12 @@ from splinecli.workshop.training.refinement import ScenePool, refinement_losses,
 
 
 @torch.no_grad()
-def errors_deg(weights: str, pool: ScenePool, captures: range) -> Floats:
-    """Return the mean errors of captures, before and after refinement, (N, 2)."""
-    pool.network = resolve_weights(weights).network.eval()
+def errors_deg(pool: ScenePool, captures: int) -> Floats:
+    """Return the mean errors of captures before and after refinement (N, 2)."""
     found = []
-    for number in captures:
+    for number in range(captures):
         losses = refinement_losses(pool.network, stack_maps([pool.photograph(number)]))
         found.append((math.degrees(losses.before), math.degrees(losses.angle)))
-        print(".", end="", flush=True)
-    print()
     return np.array(found)
 
 
@@ -48,10 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     scenes = [(found, found.entries, float(len(found.entries))) for found in opened]
     first = None
     for weights in options.weights:
-        pool = ScenePool(
-            scenes, resolve_weights(weights).network, PRESETS["refine"].pixels, options.seed
-        )
-        found = errors_deg(weights, pool, range(options.captures))
+        network = resolve_weights(weights).network.eval()
+        pool = ScenePool(scenes, network, PRESETS["refine"].pixels, options.seed)
+        found = errors_deg(pool, options.captures)
         first = found if first is None else first
         print(weights)
         for stage, errors, before in zip(("pixelwise", "refined"), found.T, first.T, strict=True):

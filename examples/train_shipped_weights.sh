@@ -69,8 +69,8 @@ run "optics${4:-}" "$folder/random" "$folder/views" --preset refine --start-from
   --param learning_rate=1e-4 --param pixels.optics_share=0.5
 
 # The mean of start and end is better on unseen scenes than either of them.
-"$python" "$(dirname "$0")/../benchmarks/combine_weights.py" mean "$folder/weights.safetensors" "$start" \
-  "$folder/optics${4:-}/weights.safetensors"
+"$python" "$(dirname "$0")/../benchmarks/combine_weights.py" mean "$start" "$folder/optics${4:-}/weights.safetensors" \
+  "$folder/weights.safetensors"
 echo "$folder/weights.safetensors"
 
 # The material net reads the tokens of the spline-net in the package, so put the new weights there first. These

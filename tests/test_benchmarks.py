@@ -174,7 +174,7 @@ def test_weights_are_combined_and_compared(run, make_set, tmp_path):
             parameter += 0.5
     save_weights(network, other)
     run(f"combine_weights join {other} spline-net {joined}")
-    run(f"combine_weights mean {mean} {joined} spline-net")
+    run(f"combine_weights mean {joined} spline-net {mean}")
     found, between = (load_weights(path).network.state_dict() for path in (joined, mean))
     for name in shipped.keys() - {"cells"}:
         added = 0.5 * (not name.startswith("refine_net."))

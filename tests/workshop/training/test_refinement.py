@@ -1,5 +1,6 @@
 """Whole scenes as captures, and the training of the refinement net on them."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -15,11 +16,12 @@ from splinecli.estimate.networks.refine_net import FEATURE_CHANNELS, channels
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import load_weights, resolve_weights
 from splinecli.maths.normals import unit
+from splinecli.system.files import UNFINISHED
 from splinecli.workshop.pixel_sets.store import Pixels, PixelSetWriter
 from splinecli.workshop.save_weights import save_weights
 from splinecli.workshop.synthesis.batches import CaptureConfig
 from splinecli.workshop.synthesis.whole_capture import photograph_scene
-from splinecli.workshop.training import WEIGHTS, refinement, tasks
+from splinecli.workshop.training import CAPTURES, WEIGHTS, refinement, tasks
 from splinecli.workshop.training.config import PRESETS
 from splinecli.workshop.training.loop import Trainer
 from splinecli.workshop.training.refinement import (
@@ -193,9 +195,7 @@ def test_captures_of_a_pool(refining, bumpy_set, tmp_path):
     assert torch.equal(one.features, again.features)
     assert not torch.equal(one.features, other.photograph(0).features)
     assert pool.sha256() == pool_of(bumpy_set, refining, 1).sha256() != other.sha256()
-    captures = CaptureFolder(pool, tmp_path)
-    captures.fill(1, 1)
-    drawn = captures.draw(3, seeded(0))
+    drawn = CaptureFolder(pool, tmp_path, 1).draw(3, seeded(0))
     # A turn changes no angle between estimate and truth, and so no loss before refinement.
     assert drawn.normals.shape == (3, 3, 26, 26)
     network = network_of(refining)
@@ -203,30 +203,31 @@ def test_captures_of_a_pool(refining, bumpy_set, tmp_path):
     assert_close(refinement_losses(network, drawn).before, straight, atol=1e-3, rtol=1e-3)
 
 
-def test_the_newest_captures_are_kept(refining, bumpy_set, tmp_path, monkeypatch):
-    monkeypatch.setattr(refinement, "MOST_CAPTURES", 3)
-    captures, other = (CaptureFolder(pool_of(bumpy_set, refining, 1), tmp_path) for _ in range(2))
-    captures.fill(2, 2)
-    for _ in range(2):
-        captures.add()
-    assert captures.numbers == [1, 2, 3]
-    assert [int(path.stem) for path in sorted(captures.folder.iterdir())] == [1, 2, 3]
-    other.fill(2, 4)
-    assert other.numbers == [1, 2, 3], "as stored"
-    captures.folder.rename(tmp_path / "lost")
-    other.fill(2, 4)
-    assert other.numbers == [2, 3], "photographed again"
-    for path in other.folder.iterdir():
-        assert path.read_bytes() == (tmp_path / "lost" / path.name).read_bytes()
+def test_stored_captures(refining, bumpy_set, tmp_path):
+    captures = CaptureFolder(pool_of(bumpy_set, refining, 1), tmp_path, 2)
+    first, second = files = sorted(captures.folder.iterdir())
+    content = first.read_bytes()
+    changed = content[:-1] + bytes([content[-1] ^ 1])
+    for damaged in (content[:-9], changed, second.read_bytes()[:0]):
+        first.write_bytes(damaged)
+        with refuses("Remove this file", ModelError):
+            captures.draw(9, seeded(0))
+    first.unlink()
+    unfinished = captures.folder / f".x{UNFINISHED}"
+    unfinished.touch()
+    CaptureFolder(captures.pool, tmp_path, 2)
+    assert sorted(captures.folder.iterdir()) == files, "photographed again"
+    assert first.read_bytes() == content
 
 
 @pytest.mark.usefixtures("no_pictures")
 def test_a_run_that_continues_ends_as_without_the_interruption(refining, tmp_path):
-    """It began with the newest captures alone."""
+    """Also if the captures were deleted. It began with the newest captures alone."""
     whole, rest = (tmp_path / name / WEIGHTS for name in ("whole", "rest"))
     refining, steps = replace(refining, schedule="stepped"), 2 * STEPS_PER_CAPTURE + 1
     Trainer(replace(refining, steps=steps), whole.parent, CPU).run()
     Trainer(replace(refining, steps=STEPS_PER_CAPTURE + 1), rest.parent, CPU).run()
+    shutil.rmtree(rest.parent / CAPTURES)
     Trainer(replace(refining, steps=steps), rest.parent, CPU, resume=True).run()
     assert whole.read_bytes() == rest.read_bytes()
 

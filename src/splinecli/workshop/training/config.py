@@ -34,7 +34,7 @@ class TrainingConfig:
     start_from: str = ""
     held_share: Share = 0.1  # share of the scenes of a pixel set that is for validation
     batch_size: Count = 256  # pixels a step; captures a step for the refinement net
-    # captures photographed before the first step, for the refinement net. With 64, it memorised
+    # captures photographed before the first step, for the refinement nets. With 64, a net memorised
     # them and was worse on others for half an hour.
     first_captures: Count = 160
     # number of parts of a batch. The pixels of a shard come from one random stream and have nearly

@@ -52,7 +52,7 @@ from splinecli.workshop.training.tasks import DROPOUT_STREAM, PixelTask, Refinem
 class Workers:
     """The rank of this process among `count` processes. The process of rank 0 is the leader.
 
-    Only the leader writes files and keeps the time.
+    Only the leader keeps the time, and writes files other than captures.
     """
 
     rank: int = 0
@@ -234,7 +234,7 @@ def enlarged(values: Tensor, initial: Tensor) -> Tensor:
 class Trainer:
     """A run and its folder: checkpoint, weights, config.json, log and pictures.
 
-    With several processes, only the leader writes files.
+    With several processes, only the leader writes files other than captures.
     """
 
     def __init__(
@@ -466,6 +466,7 @@ def open_run(
         workers.shards(config.shards)  # raises UsageError before the folder is made
         if workers.leads:
             stack.enter_context(held_folder(folder, observer.warn))
+        workers.agree(0.0, device)  # the others wait until the folder is locked
         yield Trainer(
             config,
             folder,

@@ -13,10 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save
+from safetensors.torch import save
 from torch import Tensor
 from torch.nn.functional import pad
 
+from splinecli import __version__
 from splinecli.estimate.fits.least_squares import alternating_signs
 from splinecli.estimate.inference import estimate_pixels
 from splinecli.estimate.methods.batched import NetworkEstimator
@@ -32,9 +33,10 @@ from splinecli.estimate.refinement.features import (
 )
 from splinecli.images.lens_blur import REACH
 from splinecli.lights.lighting import IndirectLight, PixelIndices, PixelLighting, parts_of_pixels
-from splinecli.system.files import write_bytes
+from splinecli.system.files import UNFINISHED, write_bytes
 from splinecli.system.machine import choose_precision
-from splinecli.system.weight_files import tensors_sha256
+from splinecli.system.publishing import refuse_link
+from splinecli.system.weight_files import read_tensors, tensors_sha256
 from splinecli.workshop.pixel_sets.store import Entry, PixelSet
 from splinecli.workshop.synthesis import stream_seed
 from splinecli.workshop.synthesis.batches import CaptureConfig
@@ -48,7 +50,7 @@ from splinecli.workshop.synthesis.whole_capture import (
 from splinecli.workshop.training.objective import angles, balanced, error_negative_log_likelihood
 
 STEPS_PER_CAPTURE = 6  # after which another capture is photographed
-MOST_CAPTURES = 6000  # of about 1.5 MB each; later ones replace the oldest
+CAPTURE_FORMAT = "splinecli-training-capture-1"
 # Shares of the scene captures that are enlarged, and of all captures with a background and of
 # engraved pieces.
 ENLARGED_SHARE, BACKGROUND_SHARE, ENGRAVED_SHARE = 0.3, 0.35, 0.4
@@ -94,22 +96,22 @@ class ScenePool:
         self.seed = seed
 
     def photograph(self, number: int) -> SceneMaps:
-        """Return a capture of another scene for each number."""
+        """Return capture `number`, of a randomly drawn scene."""
         generator = torch.Generator().manual_seed(stream_seed(self.seed, number))
         return self._after_network(*self.draw_scene(generator), generator)
 
     def sha256(self) -> str:
-        """Return a checksum of everything that the captures depend on."""
-        pixelwise = {
-            name: values.cpu()
-            for name, values in self.network.state_dict().items()
-            if not name.startswith("refine_net.")
-        }
+        """Return a checksum of the scenes, settings and weights that the captures depend on."""
+        tensors, config = (
+            {name: value for name, value in part.items() if not name.startswith("refine")}
+            for part in (self.network.state_dict(), self.network.config.to_dict())
+        )
+        weights = tensors_sha256({name: values.cpu() for name, values in tensors.items()})
         scenes = [
             (found.sha256, [entry.name for entry in entries], weight)
             for found, entries, weight in self.scenes
         ]
-        known = scenes, asdict(self.config), self.seed, tensors_sha256(pixelwise)
+        known = __version__, scenes, asdict(self.config), self.seed, config, weights
         return hashlib.sha256(json.dumps(known).encode()).hexdigest()
 
     def draw_scene(
@@ -175,61 +177,50 @@ class ScenePool:
 
 
 class CaptureFolder:
-    """The captures of a run, as files, so that a run that continues has the captures that it had.
+    """The captures of a run, as files, so that a run that continues does not photograph them again.
 
-    They lie in a folder of their own for each pool, `folder`/CHECKSUM.
+    Each pool has its own subfolder, named after its checksum.
     """
 
-    def __init__(self, pool: ScenePool, folder: Path) -> None:
+    def __init__(self, pool: ScenePool, folder: Path, count: int) -> None:
+        """Photograph the first `count` captures that are not stored. Raises OutputError."""
+        refuse_link(folder)
         self.pool = pool
         self.folder = folder / pool.sha256()[:16]
-        self.numbers: list[int] = []
-
-    def fill(self, first: int, count: int) -> None:
-        """Prepare for the step after which the pool had photographed `count` captures.
-
-        Captures from number `count - first` on are photographed if they are not stored.
-        """
-        self.numbers = [
-            number
-            for number in range(max(0, count - MOST_CAPTURES), count)
-            if number >= count - first or self._path(number).exists()
-        ]
-        for number in self.numbers:
-            self._make(number)
+        for unfinished in self.folder.glob(f".*{UNFINISHED}"):  # left by a killed process
+            unfinished.unlink(missing_ok=True)
+        self.count = 0
+        while self.count < count:
+            self.add()
 
     def add(self) -> None:
-        """Photograph another scene. Beyond MOST_CAPTURES it replaces the oldest capture. Raises
-        OutputError.
-        """
-        self.numbers.append(self.numbers[-1] + 1)
-        self._make(self.numbers[-1])
-        if len(self.numbers) > MOST_CAPTURES:
-            self._path(self.numbers.pop(0)).unlink(missing_ok=True)
+        """Add the next capture, which is photographed unless it is stored. Raises OutputError."""
+        path = self._path(self.count)
+        if not path.exists():
+            tensors = self.pool.photograph(self.count)._asdict()
+            metadata = {"format": CAPTURE_FORMAT, "tensors_sha256": tensors_sha256(tensors)}
+            write_bytes(path, save(tensors, metadata))
+        self.count += 1
 
     def draw(self, count: int, generator: torch.Generator) -> SceneMaps:
         """Draw `count` captures, rotate and mirror each, and return them stacked as float32 (count,
-        ...).
+        ...). Raises ModelError if a file is damaged.
         """
         drawn = []
-        for index in torch.randint(len(self.numbers), (count,), generator=generator).tolist():
-            example = SceneMaps(**load_file(self._path(self.numbers[index])))
+        for number in torch.randint(self.count, (count,), generator=generator).tolist():
+            hint = "Remove this file and add --resume to photograph the capture again"
+            capture = SceneMaps(**read_tensors(self._path(number), CAPTURE_FORMAT, hint)[0])
             draw = torch.rand(3, generator=generator).tolist()
             turn = MapTurn(int(4 * draw[0]), draw[1] < 0.5)
-            features = turn_features(example.features, turn).clone()
+            features = turn_features(capture.features, turn).clone()
             if draw[2] < 0.5:
                 features[channels("halves")].neg_()
-            normals = turn_maps(example.normals, turn, vectors=((0, 1),))
-            drawn.append(SceneMaps(features, normals, turn_maps(example.mask, turn)))
+            normals = turn_maps(capture.normals, turn, vectors=((0, 1),))
+            drawn.append(SceneMaps(features, normals, turn_maps(capture.mask, turn)))
         return stack_maps(drawn)
 
     def _path(self, number: int) -> Path:
         return self.folder / f"{number:06}.safetensors"
-
-    def _make(self, number: int) -> None:
-        if not self._path(number).exists():
-            content = save(self.pool.photograph(number)._asdict())
-            write_bytes(self._path(number), content)
 
 
 def _placed(values: Tensor, mask: Tensor) -> Tensor:

@@ -3,8 +3,7 @@ its checkpoints.
 
 A checkpoint is one safetensors file from which a run continues where it stopped. It does not
 contain the state of random generators, because the draws of a step depend only on the seed and the
-number of the step. A resumed run of the refinement net simulates its newest captures again and
-continues without the earlier ones.
+number of the step.
 """
 
 import csv

@@ -200,8 +200,9 @@ class PixelTask:
         self._held = pixel_source(config, self.sets.validation, held, validates=True)
 
     def prepare(self, network: SplineNet, folder: Path, *, rank: int, step: int) -> None:
-        """Draw the data of process `rank` for the first step of this run, `step`, in its folder.
-        Only process 0 validates.
+        """Prepare the data of process `rank` for step `step`. Only process 0 validates.
+
+        `folder` is the folder of the run.
         """
         if rank == 0:
             # At least 64 pixels at a time, because a draw has one source
@@ -303,7 +304,7 @@ def _estimate(
 class RefinementTask:
     """Captures of whole scenes, photographed before and during training; see ScenePool."""
 
-    long_start = "photographing the first captures, for some minutes"
+    long_start = "preparing the captures, which may take minutes"
 
     def __init__(self, config: TrainingConfig, shards: range, device: torch.device) -> None:
         self.config = config
@@ -326,9 +327,9 @@ class RefinementTask:
         pool = self._pool(
             self.sets.training, network, stream_seed(self.config.seed, rank, _POOL_STREAM)
         )
-        self.captures = CaptureFolder(pool, folder / CAPTURES)
         # One is added before step 0 and so on.
-        self.captures.fill(first, first - (-step // STEPS_PER_CAPTURE))
+        count = first - (-step // STEPS_PER_CAPTURE)
+        self.captures = CaptureFolder(pool, folder / CAPTURES, count)
         if rank == 0:
             seed = stream_seed(self.config.seed, 0, _VALIDATION_STREAM)
             held = self._pool(self.sets.validation, network, seed)
