@@ -1,18 +1,15 @@
-"""Render scenes for the light network and train it: how assets/light-net.safetensors was made.
+"""Train the light network on pixel sets of rendered scenes.
 
-    python benchmarks/train_light_net.py render FOLDER --scenes 2400
-    python benchmarks/train_light_net.py train FOLDER --minutes 85 -o light-net.safetensors
+    python benchmarks/train_light_net.py train SET... --steps 60000 -o light-net.safetensors
+    python benchmarks/train_light_net.py shapes FOLDER
 
-Both go on after an interruption. The shipped weights saw 1,880 scenes in three classes of materials
-each, in two legs of 22,000 and 11,000 steps: about 300,000 captures. The second leg began from the
-first with a rate of 0.0012, and had twice the scenes. These scenes had no groups and few hollows,
-and the captures up to 100 lights.
+The sets are those of examples/render_training_scenes.sh. `train` continues after an interruption.
+`shapes` writes spheres, ellipsoids and unions of them, for the sets smooth-*.
 """
 
 import argparse
 import math
-import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +19,10 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from torch.utils.data import DataLoader, IterableDataset
 
 from splinecli.lights.light_net import LIGHT_FORMAT, LightNet, network_inputs, square_images
+from splinecli.system.files import write_bytes
+from splinecli.workshop.pixel_sets.store import Entry, PixelSet, open_pixel_set
 from splinecli.workshop.save_weights import save_module
-from splinecli.workshop.synthesis import draw_number, groups, shapes
-from splinecli.workshop.synthesis.draw_materials import CLASSES
+from splinecli.workshop.synthesis import draw_number, shapes, stream_seed
 from splinecli.workshop.synthesis.lights import choose_in_cone, draw_light_directions
 from splinecli.workshop.synthesis.meshes import (
     Mesh,
@@ -33,49 +31,26 @@ from splinecli.workshop.synthesis.meshes import (
     smooth_union,
     triangulate,
 )
-from splinecli.workshop.synthesis.scenes import SceneConfig, draw_scene, render_scene
 from splinecli.workshop.synthesis.whole_capture import add_background
+from splinecli.workshop.training.tasks import split_scenes
 
-CONFIG = SceneConfig(size=72, lights=64, samples=2, directions=24, bounces=2)
-SPACING, FEWEST_FACES = 0.025, 1500  # coarser than other scenes: the network sees 48 pixels
-# Shares of smooth shapes, and of bowls, niches and bodies beside each other; the others are random
-# shapes.
-SMOOTH_SHARE, GROUP_SHARE = 0.35, 0.35
 HELD_SHARE = 0.04
 IMAGES_PER_STEP, MOST_CAPTURES = 96, 16
 RATE = 2e-3
+Scenes = Sequence[tuple[PixelSet, Entry]]
 
 
-def render(folder: Path, scenes: int, seed: int = 1) -> None:
-    """Render scenes that the folder does not have: random shapes, smooth ones, and groups."""
-    shapes.SPACING, shapes.FEWEST_FACES = SPACING, FEWEST_FACES
-    groups.SPACING, groups.FEWEST_FACES = 0.04, 500
+def write_smooth(folder: Path, count: int, seed: int) -> None:
+    """Write smooth meshes that the folder does not have."""
+    import trimesh
+
     folder.mkdir(parents=True, exist_ok=True)
-    for index in range(scenes):
-        path = folder / f"{index:05d}.npz"
-        if path.exists():
-            continue
-        rng = np.random.default_rng([seed, index, 77])
-        kind, mesh = rng.random(), None
-        if kind < SMOOTH_SHARE:
-            mesh = draw_smooth(rng)
-        elif kind < SMOOTH_SHARE + GROUP_SHARE:
-            _, mesh = groups.draw_group(rng, (), rng.random())
-        scene = draw_scene(seed, index, CONFIG, mesh)
-        done = render_scene(scene, CONFIG)
-        observations = {
-            name: values.astype(np.float16) for name, values in done.observations.items()
-        }
-        new = path.with_suffix(".tmp.npz")
-        np.savez(
-            new,
-            mask=done.mask,
-            lights=scene.lights,
-            normals=done.normals.astype(np.float16),
-            **observations,
-        )
-        new.replace(path)
-        print(path, flush=True)
+    for index in range(count):
+        path = folder / f"smooth{index:03}.ply"
+        if not path.exists():
+            mesh = draw_smooth(np.random.default_rng([seed, index, 77]))
+            content = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(None, "ply")
+            write_bytes(path, content)
 
 
 def draw_smooth(rng: np.random.Generator) -> Mesh:
@@ -104,25 +79,22 @@ def draw_smooth(rng: np.random.Generator) -> Mesh:
 
 class Captures(IterableDataset):
     """Endless batches of captures: inputs (B, F, C, S, S), directions (B, F, 3), log intensities
-    (B, F), bumps (B,).
+    (B, F), bumps (B,). Batch `first` is the first one.
     """
 
-    def __init__(self, folder: Path, first: int, *, held: bool) -> None:
-        files = sorted(folder.glob("*[0-9].npz"))
-        n_held = max(1, round(HELD_SHARE * len(files)))
-        self.files = files[:n_held] if held else files[n_held:]
-        self.first, self.held = first, held
+    def __init__(self, scenes: Scenes, seed: int, first: int = 0) -> None:
+        self.scenes, self.seed, self.first = scenes, seed, first
 
     def __iter__(self) -> Iterator[tuple[Tensor, ...]]:
         torch.set_num_threads(1)
         step = self.first
         while True:
-            generator = torch.Generator().manual_seed(1_000_003 * (1 + self.held) + step)
+            generator = torch.Generator().manual_seed(stream_seed(self.seed, step))
             lights = int(4 * (31 / 4) ** draw_number(generator))
             captures: list[tuple[Tensor, ...]] = []
             while len(captures) < max(2, min(MOST_CAPTURES, IMAGES_PER_STEP // lights)):
-                file = self.files[int(torch.randint(len(self.files), (), generator=generator))]
-                captures += photograph(file, lights, generator)
+                scene = self.scenes[int(torch.randint(len(self.scenes), (), generator=generator))]
+                captures += photograph(*scene, lights, generator)
             yield tuple(torch.stack(part) for part in zip(*captures, strict=True))
             step += 1
 
@@ -137,7 +109,9 @@ def bump_of(normals: Tensor, mask: Tensor) -> Tensor:
     return (slopes * across).sum() / (slopes.norm(dim=0) * across.norm(dim=0)).sum().clamp(min=1e-6)
 
 
-def photograph(file: Path, count: int, generator: torch.Generator) -> list[tuple[Tensor, ...]]:
+def photograph(
+    pixel_set: PixelSet, entry: Entry, count: int, generator: torch.Generator
+) -> list[tuple[Tensor, ...]]:
     """Photograph a scene under `count` lights, with the faults of a capture; an empty list where
     too little is seen.
 
@@ -148,15 +122,16 @@ def photograph(file: Path, count: int, generator: torch.Generator) -> list[tuple
     def uniform(low: float = 0.0, high: float = 1.0) -> float:
         return draw_number(generator, low, high)
 
-    with np.load(file) as scene:
-        lights, mask = torch.from_numpy(scene["lights"]).float(), torch.from_numpy(scene["mask"])
-        chosen = choose(lights, count, generator)
-        lights = lights[chosen]
-        images, normals = torch.zeros(count, *mask.shape), torch.zeros(3, *mask.shape)
-        images[:, mask] = (
-            torch.from_numpy(scene[list(CLASSES)[int(3 * uniform())]][:, chosen.numpy()]).float().T
-        )
-        normals[:, mask] = torch.from_numpy(scene["normals"]).float().T
+    pixels = pixel_set.load(entry)
+    lights, mask = (
+        torch.from_numpy(np.array(part)) for part in (pixels.light_directions, pixels.mask)
+    )
+    chosen = choose(lights, count, generator)
+    lights = lights[chosen]
+    images, normals = torch.zeros(count, *mask.shape), torch.zeros(3, *mask.shape)
+    observations = pixels.observations[:, chosen.numpy()].astype(np.float32)
+    images[:, mask] = torch.from_numpy(observations).T
+    normals[:, mask] = torch.from_numpy(np.array(pixels.normals, np.float32)).T
     if uniform() < 0.3:
         side = int(min(mask.shape) * uniform(0.35, 0.8))
         top, left = (int(uniform(0, size - side)) for size in mask.shape)
@@ -232,8 +207,19 @@ def losses(
     return likelihood.mean(), angle.mean(), (guess.log_intensities - intensities).abs().mean(), side
 
 
-def train(folder: Path, minutes: float, output: Path) -> None:
-    """Train for so many minutes, and write the running average of the weights."""
+def train(sets: Sequence[Path], steps: int, output: Path) -> None:
+    """Train for so many steps, and write the running average of the weights."""
+    opened = [open_pixel_set(path) for path in sets]
+    split = [split_scenes(found.entries, HELD_SHARE) for found in opened]
+    training, held = (
+        [
+            (found, entry)
+            for found, parts in zip(opened, split, strict=True)
+            for entry in parts[part]
+        ]
+        for part in (0, 1)
+    )
+    torch.manual_seed(0)
     network, average = LightNet().to(memory_format=torch.channels_last), LightNet()
     optimiser = torch.optim.AdamW(
         network.parameters(), RATE, betas=(0.9, 0.99), weight_decay=1e-3, fused=True
@@ -245,14 +231,10 @@ def train(folder: Path, minutes: float, output: Path) -> None:
         for part, name in ((network, "network"), (average, "average"), (optimiser, "optimiser")):
             part.load_state_dict(state[name])
         step = state["step"]
-    batches = iter(
-        DataLoader(
-            Captures(folder, step, held=False), batch_size=None, num_workers=1, prefetch_factor=6
-        )
-    )
-    begin = time.time()
-    while (done := (time.time() - begin) / 60 / minutes) < 1:
-        rate = RATE * min(1, (step + 1) / 100) * (1 + math.cos(math.pi * done)) / 2 + 1e-6
+    captures = Captures(training, 0, step)
+    batches = iter(DataLoader(captures, batch_size=None, num_workers=1, prefetch_factor=6))
+    while step < steps:
+        rate = RATE * min(1, (step + 1) / 100) * (1 + math.cos(math.pi * step / steps)) / 2 + 1e-6
         for group in optimiser.param_groups:
             group["lr"] = rate
         likelihood, angle, intensity, side = losses(network, *next(batches))
@@ -264,34 +246,41 @@ def train(folder: Path, minutes: float, output: Path) -> None:
         with torch.no_grad():
             kept = min(0.999, (step + 1) / (step + 10))
             torch._foreach_lerp_(list(average.parameters()), list(network.parameters()), 1 - kept)
-        if step % 1000 == 0:
+        if step % 1000 == 0 or step == steps:
             state = {"network": network.state_dict(), "average": average.state_dict()}
             torch.save({**state, "optimiser": optimiser.state_dict(), "step": step}, checkpoint)
-            print(step, f"{validate(average, folder):.2f} degrees on held scenes", flush=True)
+            print(step, f"{validate(average, held):.2f} degrees on held scenes", flush=True)
     save_module(average, output, {"format": LIGHT_FORMAT})
-    print(step, f"{validate(average, folder):.2f} degrees on held scenes, {output}")
 
 
 @torch.inference_mode()
-def validate(network: LightNet, folder: Path, batches: int = 40) -> float:
+def validate(network: LightNet, held: Scenes, batches: int = 40) -> float:
     """Return the mean error of the directions in degrees on captures of held scenes."""
-    held = iter(Captures(folder, 0, held=True))
+    captures = iter(Captures(held, 1))
     return math.degrees(
-        sum(float(losses(network, *next(held))[1]) for _ in range(batches)) / batches
+        sum(float(losses(network, *next(captures))[1]) for _ in range(batches)) / batches
     )
 
 
-if __name__ == "__main__":
+def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("step", choices=("render", "train"))
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--scenes", type=int, default=960)
-    parser.add_argument("--minutes", type=float, default=85)
-    parser.add_argument("-o", "--output", type=Path, default=Path("light-net.safetensors"))
-    given = parser.parse_args()
-    if given.step == "render":
-        render(given.folder, given.scenes)
+    commands = parser.add_subparsers(dest="command", required=True)
+    drawing = commands.add_parser("shapes")
+    drawing.add_argument("folder", type=Path)
+    drawing.add_argument("--count", type=int, default=30)
+    drawing.add_argument("--seed", type=int, default=0)
+    training = commands.add_parser("train")
+    training.add_argument("sets", type=Path, nargs="+")
+    training.add_argument("--steps", type=int, default=60_000)
+    training.add_argument("-o", "--output", type=Path, default=Path("light-net.safetensors"))
+    options = vars(parser.parse_args(arguments))
+    if options.pop("command") == "shapes":
+        write_smooth(**options)
     else:
-        train(given.folder, given.minutes, given.output)
+        train(**options)
+
+
+if __name__ == "__main__":
+    main()

@@ -13,13 +13,18 @@ import torch
 from pytest import approx
 from safetensors.numpy import load_file
 
-from scenes import parametrize, read_json
+from scenes import ball, parametrize, read_json
 from splinecli import __version__
 from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import load_weights, resolve_weights
 from splinecli.judge.judge_net import CLASSES, JudgeNet
+from splinecli.lights.light_net import LIGHT_FORMAT, LightNet
+from splinecli.maths.normals import unit
+from splinecli.system.weight_files import load_module
+from splinecli.workshop.pixel_sets.store import Pixels, PixelSetWriter
 from splinecli.workshop.save_weights import save_weights
+from splinecli.workshop.synthesis.meshes import read_mesh
 
 ROOT = Path(__file__).resolve().parents[1]
 MEDALLION = str(ROOT / "examples/medallion")
@@ -239,6 +244,31 @@ def test_judgement(run, tmp_path):
     printed = run(f"judgement report {found}")
     assert "| tilt | 3 | " in printed
     assert run(f"judgement report {found} {found}") == printed
+
+
+def test_train_light_net(run, tmp_path, monkeypatch, rng):
+    """It learns the lights of matte spheres, also after an interruption, and writes smooth
+    meshes.
+    """
+    writer = PixelSetWriter(tmp_path / "set")
+    normals, mask = ball((40, 40), 19.5, 19.5, 19)
+    lights = np.float32(unit(rng.normal(size=(64, 3)) * (1, 1, 0.2) + (0, 0, 1)))
+    observations = np.float32((normals[mask] @ lights.T).clip(0))
+    for name in "ab":
+        writer.add(name, name, "", {}, Pixels(observations, normals[mask], lights, mask))
+    writer.finish()
+    monkeypatch.setattr("train_light_net.IMAGES_PER_STEP", 8)
+    out = tmp_path / "net.safetensors"
+    errors = [
+        numbers(run(f"train_light_net train {tmp_path}/set --steps {steps} -o {out}").split()[1])[0]
+        for steps in (1, 150)
+    ]
+    assert errors[1] < 0.7 * errors[0]
+    load_module(LightNet(), out, LIGHT_FORMAT)
+    run(f"train_light_net shapes {tmp_path}/shapes --count 2")
+    for path in (tmp_path / "shapes").iterdir():
+        mesh = read_mesh(path)
+        assert np.abs(mesh.vertices[:, :2]).max() <= 1 and len(mesh.faces) > 1000
 
 
 def test_train_judge_net(run, tmp_path, coarse_shapes, monkeypatch, rng):
