@@ -34,8 +34,8 @@ for name in "$@"; do
     fine-*) scenes="--groups 8 --size 256 --seed $((7200 + number))" ;;
     random-*) scenes="--scenes 30 --seed $((7300 + number))" ;;
     views-*) scenes="--views 1 --seed $((7400 + number))" ;;
-    smooth-*)  # for the light network
-      scenes="--views 2 --seed $((7500 + number))"
+    smooth-*) # for the light network
+      scenes="--views 2 --size 96 --seed $((7500 + number))"
       meshes=$folder/shapes-$name
       "$python" "$(dirname "$0")/../benchmarks/train_light_net.py" shapes "$meshes" --seed $((7500 + number))
       ;;
