@@ -164,8 +164,7 @@ def _estimate(
     if estimator.refiner is not None:
         advance = clock.begin("refine", capture.n_pixels, "refining")
         known = capture.mask, capture.observations, lighting_at
-        blur = capture.removed_blur
-        estimator.refiner.refine(*known, normals, errors, removed_blur=blur, progress=advance)
+        estimator.refiner.refine(*known, normals, errors, progress=advance)
     judged = correct_errors(capture, estimator, lighting_at, normals, errors)
     of_lights = (
         () if capture.light_errors_deg is None else (float(capture.light_errors_deg.mean()),)

@@ -1,5 +1,5 @@
-"""The refinement net: symmetries, the mask, how far it sees; pixels see their own capture, and no
-others.
+"""The refinement net: symmetries, the mask and its reach; the context of pixels is their own
+capture.
 """
 
 import pytest
@@ -24,7 +24,6 @@ from splinecli.estimate.refinement.features import (
     turn_features,
     turn_maps,
 )
-from splinecli.workshop.training.loop import enlarged
 from tiny_networks import TINY, random_network
 
 HEIGHT, WIDTH = 6, 9
@@ -189,33 +188,3 @@ def test_the_exposure_of_a_capture_does_not_matter_but_the_brightness_of_a_pixel
     assert_close(network(37 * observations, lights).normals, whole, atol=1e-5, rtol=0)
     darker = observations * torch.linspace(0.1, 1, 16)[:, None]
     assert (network(darker, lights).normals - whole).abs().max() > 1e-3
-
-
-@parametrize(
-    "larger", [{"widths": (48, 96, 144, 96)}, {"reads_blur": True}, {"layers": 1}], ids=str
-)
-def test_a_larger_net_begins_with_the_results_of_the_smaller_one(larger):
-    small, large = random_net(), RefineNet(**larger).eval()
-    own = large.state_dict()
-    large.load_state_dict(
-        own | {name: enlarged(values, own[name]) for name, values in small.state_dict().items()}
-    )
-    # In double precision, because random weights give errors of up to 1e5.
-    maps = [each.double() for each in random_maps(24, 40)]
-    for found, expected in zip(large.double()(*maps), small.double()(*maps), strict=True):
-        assert_close(found, expected, atol=1e-7, rtol=1e-7)
-
-
-def test_attention_reaches_the_whole_mask_and_nothing_outside():
-    net = random_net(layers=1)
-    features, mask = random_maps(16, 400)
-    mask[..., 240:] = 0
-    mask[..., 0, 239] = 1
-    features = features * mask
-    near = net(features, mask)[0]
-    assert_close(
-        net(features[..., :240], mask[..., :240])[0], near[..., :240], atol=1e-4, rtol=1e-4
-    )
-    changed = features.clone()
-    changed[..., 0, 239] += mask[..., 0, 239]
-    assert not torch.equal(net(changed, mask)[0][..., 0], near[..., 0]), "239 pixels away"

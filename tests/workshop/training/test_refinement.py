@@ -12,7 +12,7 @@ from torch.testing import assert_close
 from distributions import FAULTLESS, seeded
 from scenes import refuses
 from splinecli.errors import ModelError, UsageError
-from splinecli.estimate.networks.refine_net import FEATURE_CHANNELS, channels
+from splinecli.estimate.networks.refine_net import FEATURE_CHANNELS
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import load_weights, resolve_weights
 from splinecli.maths.normals import unit
@@ -48,7 +48,7 @@ def test_ambient_light_is_the_same_in_all_images_of_a_capture():
     """It is between a share of the pixel's mean and of the capture's mean."""
     radiance, directions = scene()
     config = replace(PLAIN, ambient_share=1.0)
-    observations, _, exposure, _ = photograph_scene(radiance, directions, config, seeded(4))
+    observations, _, exposure = photograph_scene(radiance, directions, config, seeded(4))
     added = torch.where(observations < 1, observations / exposure - radiance, torch.nan)
     assert added.nan_to_num(0).amax(1).sub(added.nan_to_num(9).amin(1)).max() < 1e-5
     means = torch.stack(
@@ -264,36 +264,3 @@ def test_the_loss_of_detail_does_not_count_what_turns_all_normals(refining):
     for estimate, most, least in ((tilted, 0.4, 0.0), (smoothed, 9.0, 0.5)):
         without, with_detail = losses_of(estimate)
         assert least < (with_detail - without) / without < most
-
-
-def test_pixels_at_edges_count_more(refining):
-    """A plate with a step of 90 degrees, and the estimate off by 10 degrees at the step alone."""
-    network = network_of(refining)
-    truth = torch.zeros(1, 3, 8, 16)
-    truth[:, 2, :, :8] = truth[:, 0, :, 8:] = 1
-    estimate = truth.clone()
-    angle = np.radians(10)
-    estimate[:, 1, :, 7:9] = np.sin(angle)
-    estimate[:, 2, :, 7] = estimate[:, 0, :, 8] = np.cos(angle)
-    features = torch.zeros(1, FEATURE_CHANNELS, 8, 16)
-    features[:, :3] = estimate
-    maps = SceneMaps(features, truth, torch.ones(1, 1, 8, 16))
-    plain, weighted = (
-        refinement_losses(network, maps, edge_weight=weight).total for weight in (0.0, 3.0)
-    )
-    # Two columns out of 16 are off and have the weight 1 + 3 sqrt(2), the others 1. For the
-    # divisor, see `balanced`.
-    mean, at_edges = (
-        angle * 2 / 16,
-        angle * 2 * (1 + 3 * np.sqrt(2)) / (14 + 2 * (1 + 3 * np.sqrt(2))),
-    )
-    typical = np.radians(2.5)
-    expected = np.sqrt(2 * typical) * (at_edges - mean) / np.sqrt(mean + typical)
-    assert (weighted - plain).item() == pytest.approx(expected, rel=0.02)
-
-
-def test_the_removed_blur_is_an_input(refining, bumpy_set):
-    pool = pool_of(bumpy_set, refining, 3, optics_share=1.0)
-    captures = map(pool.photograph, range(12))
-    blurs = [float(capture.features[channels("removed_blur")].max()) for capture in captures]
-    assert min(blurs) == 0 and max(blurs) > 0.4, "the least that is removed"

@@ -21,13 +21,6 @@ from splinecli.maths.observation_map import MAP_SIZE, Grid
 from splinecli.records.base import settings
 
 HEAD_WIDTH = 16  # channels of an attention head of the set branch
-# channels of the refinement net at full, half, quarter and eighth resolution
-REFINE_WIDTHS = (
-    32,
-    64,
-    96,
-    64,
-)
 
 
 STARTING_FITS: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
@@ -95,10 +88,6 @@ class NetworkConfig:
     # whether a refinement net corrects the map of normals afterwards. Needs an error head.
     refines: bool = False
     refines_twice: bool = False  # whether a second refinement net follows the first
-    # refine_widths, refine_reads_blur, refine_layers: see RefineNet
-    refine_widths: tuple[Width, Width, Width, Width] = REFINE_WIDTHS
-    refine_reads_blur: bool = False
-    refine_layers: Annotated[int, Meta(ge=0, le=64)] = 0
     # channels of the set branch, 0 for none. Compact size only.
     set_width: Annotated[int, Meta(ge=0, le=4096)] = 0
     set_layers: Depth = 3  # attention layers of the set branch
@@ -137,9 +126,6 @@ class NetworkConfig:
             },
             "'refines' needs 'error_head'": config.refines and not config.error_head,
             "'refines_twice' needs 'refines'": config.refines_twice and not config.refines,
-            f"'refine_layers' needs refine_widths that end with a multiple of {HEAD_WIDTH}": (
-                config.refine_layers and config.refine_widths[-1] % HEAD_WIDTH
-            ),
             "'sees_capture' needs 'set_width' above 0": (
                 config.sees_capture and not config.set_width
             ),

@@ -13,9 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, max_pool2d, pad
 
-from splinecli.estimate.networks.config import REFINE_WIDTHS
 from splinecli.estimate.networks.li_ne_net import ResidualBlock, zeroed
-from splinecli.estimate.networks.set_branch import AttentionLayer
 
 FEATURE_WIDTHS = {
     "normal": 3,  # the estimated normal
@@ -37,8 +35,6 @@ FEATURE_WIDTHS = {
     "halves": 3,
     # of least squares; not read by the net, but used by restore_detail in refinement/detail.py
     "noise": 1,
-    # width in pixels of the blur that was removed from the images; see RefineNet
-    "removed_blur": 1,
 }
 """The features and their numbers of channels. The first two channels of a vector are x and y."""
 
@@ -51,7 +47,7 @@ def channels(name: str) -> slice:
 
 
 FEATURE_CHANNELS = sum(FEATURE_WIDTHS.values())
-READ = channels("noise").start  # number of channels that every net reads
+READ = channels("noise").start  # number of channels read by the net
 # Channels with the x and y components of vectors, which rotate with the image.
 VECTORS = tuple(
     (channels(name).start, channels(name).start + 1)
@@ -91,10 +87,11 @@ def with_refined(features: Tensor, normals: Tensor, error: Tensor) -> Tensor:
     return changed
 
 
+WIDTHS = (32, 64, 96, 64)  # channels at full, half, quarter and eighth resolution
 # Widths in pixels of smoothed normals, which the net weights against the estimated normal
 SIGMAS = (0.7, 1.5, 3.0)
 # Side of a pixel at the coarsest scale. Tile origins are multiples of COARSEST.
-COARSEST = 2 ** (len(REFINE_WIDTHS) - 1)
+COARSEST = 2 ** (len(WIDTHS) - 1)
 Box = tuple[slice, slice]  # rows and columns of a map
 
 
@@ -111,44 +108,26 @@ class RefineNet(nn.Module):
 
     `twice` adds a second such net, `again`, which corrects the result. It reads the same features
     as the first, with the normals and errors replaced by the first net's results. `reach` is the
-    distance in pixels beyond which other pixels do not affect a result, except through the
-    attention.
-
-    `widths` are the channels at full, half, quarter and eighth resolution. With `reads_blur`, the
-    width of the removed blur is an input, which tells whether detail was lost. `layers` is the
-    number of layers in which all positions at an eighth of the resolution attend to each other.
+    distance in pixels beyond which other pixels do not affect a result.
     """
 
-    def __init__(
-        self,
-        *,
-        twice: bool = False,
-        widths: Sequence[int] = REFINE_WIDTHS,
-        reads_blur: bool = False,
-        layers: int = 0,
-    ) -> None:
+    def __init__(self, *, twice: bool = False) -> None:
         super().__init__()
-        self.reads_blur = reads_blur
-        self.enter = nn.Conv2d(READ + 1 + 3 * len(SIGMAS) + reads_blur, widths[0], 3, padding=1)
+        self.enter = nn.Conv2d(READ + 1 + 3 * len(SIGMAS), WIDTHS[0], 3, padding=1)
         self.down = nn.ModuleList(
-            nn.Conv2d(fine, coarse, 2, stride=2) for fine, coarse in pairwise(widths)
+            nn.Conv2d(fine, coarse, 2, stride=2) for fine, coarse in pairwise(WIDTHS)
         )
-        self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(widths))
+        self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(WIDTHS))
         self.encode = nn.ModuleList(
             nn.ModuleList(ResidualBlock(width) for _ in range(count))
-            for width, count in zip(widths, (1, 2, 3, 2), strict=True)  # in the encoder
-        )
-        self.attend = nn.ModuleList(
-            AttentionLayer(widths[-1], starts_idle=True) for _ in range(layers)
+            for width, count in zip(WIDTHS, (1, 2, 3, 2), strict=True)  # in the encoder
         )
         self.decode = nn.ModuleList(
             nn.ModuleList(ResidualBlock(width) for _ in range(count))
-            for width, count in zip(widths, (1, 1, 0), strict=False)  # in the decoder
+            for width, count in zip(WIDTHS, (1, 1, 0), strict=False)  # in the decoder
         )
-        self.out = zeroed(nn.Conv2d(widths[0], 5 + len(SIGMAS), 3, padding=1))
-        self.again = (
-            RefineNet(widths=widths, reads_blur=reads_blur, layers=layers) if twice else None
-        )
+        self.out = zeroed(nn.Conv2d(WIDTHS[0], 5 + len(SIGMAS), 3, padding=1))
+        self.again = RefineNet() if twice else None
         self.reach = 96 * (1 + twice)  # 96 per net
 
     def forward(
@@ -188,9 +167,7 @@ class RefineNet(nn.Module):
         smoothed = (unit_maps(gaussian_sum(normals * weight, sigma)) * mask for sigma in SIGMAS)
         towards = [smooth - normals for smooth in smoothed]
         # In place if possible, because a tile's maps of 32 channels determine the memory required.
-        read = [features[:, :READ], *towards, mask]
-        if self.reads_blur:
-            read.append(features[:, channels("removed_blur")])
+        read = features[:, :READ], *towards, mask
         x = self.enter(_joined(read, border, layers)).mul_(masks[0]).to(stream)
         mask, normals, error, *towards = (
             maps[..., *inner].contiguous() for maps in (mask, normals, error, *towards)
@@ -202,7 +179,6 @@ class RefineNet(nn.Module):
                 x = self.down[scale - 1](x).mul_(masks[scale]).to(stream)
             for block in blocks:  # type: ignore[attr-defined]
                 x = block(x, masks[scale])
-        x = self._attend(x, masks[-1])
         origin = (0, 0)
         for scale in reversed(range(len(passed))):
             # The minimum margin, in pixels of each scale, that the decoder needs around a part of
@@ -220,17 +196,6 @@ class RefineNet(nn.Module):
         for weight, difference in zip(change[:, 5:].split(1, dim=1), towards, strict=True):
             corrected = corrected + weight * difference
         return unit_maps(corrected) * mask, (error + change[:, 3:5]) * mask
-
-    def _attend(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Return features (B, C, h, w) after the attention between all positions of a mask (B, 1,
-        h, w).
-        """
-        if not len(self.attend):
-            return x
-        tokens, among = x.flatten(2).mT, (mask > 0).flatten(2)[:, None]
-        for layer in self.attend:
-            tokens = layer(tokens, among)
-        return tokens.mT.reshape(x.shape).mul(mask).to(x.dtype)
 
 
 def _joined(maps: Sequence[Tensor], border: tuple[int, ...], dtype: torch.dtype) -> Tensor:

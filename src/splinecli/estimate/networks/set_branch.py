@@ -217,20 +217,17 @@ class SetBranch(nn.Module):
 class AttentionLayer(nn.Module):
     """Attention and a perceptron on tokens (P, T, width). Each is preceded by a layer norm and
     added to its input.
-
-    With `starts_idle`, it initially adds nothing.
     """
 
-    def __init__(self, width: int, *, starts_idle: bool = False) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
         self.heads = width // HEAD_WIDTH
         self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)
         self.queries_keys_values = nn.Linear(width, 3 * width)
         self.attended = nn.Linear(width, width)
-        last = nn.Linear(2 * width, width)
-        self.perceptron = nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), last)
-        if starts_idle:
-            zeroed(self.attended), zeroed(last)
+        self.perceptron = nn.Sequential(
+            nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
+        )
 
     def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
         pixels, count, width = tokens.shape

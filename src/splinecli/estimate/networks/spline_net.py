@@ -107,9 +107,6 @@ class SplineNet(nn.Module):
         if config.refines:
             self.refine_net = RefineNet(
                 twice=config.refines_twice,
-                widths=config.refine_widths,
-                reads_blur=config.refine_reads_blur,
-                layers=config.refine_layers,
             )
         cells, _ = cell_directions(config.map_size)
         inside = unit_disc(config.map_size, config.grid)

@@ -27,8 +27,6 @@ def refine_features(
     error: Tensor,
     reference: float,
     signs: Tensor,
-    *,
-    removed_blur: float | None = None,
 ) -> Tensor:
     """Return the features (P, FEATURE_CHANNELS) of pixels in the order of FEATURE_WIDTHS, each
     about -1 to 1.
@@ -36,8 +34,7 @@ def refine_features(
     The observations (P, F) are linear, divided by the light intensities. The light directions (F,
     3) or (P, F, 3) and the normals (P, 3) are unit. See networks/li_ne_net.py for the error (P, 2),
     `brightness` for the reference, and alternating_signs of fits/least_squares.py for the signs
-    (F,), the halves of the capture's lights. For the removed blur, see remove_blur of
-    restoration/lens_blur.py.
+    (F,), the halves of the capture's lights.
     """
     scale = map_scale(observations)
     observed = observations / scale
@@ -70,7 +67,6 @@ def refine_features(
         "n_lights": torch.full_like(scale, math.log(count / 10)),
         "halves": (3.0 * change).clamp(-1, 1),
         "noise": noise.clamp(-1, 1),
-        "removed_blur": torch.full_like(scale, removed_blur or 0.0),
     }
     return torch.cat([features[name] for name in FEATURE_WIDTHS], dim=1)
 

@@ -78,7 +78,6 @@ class _Capture:
     errors: Float32Array
     reference: float  # reference, signs: of the whole capture; see refine_features
     signs: torch.Tensor
-    removed_blur: float  # in pixels
 
 
 @dataclass(eq=False)
@@ -114,7 +113,6 @@ class NetworkRefiner:
         normals: Float32Array,
         errors: Float32Array,
         *,
-        removed_blur: float | None = None,
         progress: Progress = ignore,
     ) -> None:
         """Refine normals (P, 3) and the distributions (P, 2) of their errors in place.
@@ -122,8 +120,8 @@ class NetworkRefiner:
         They are the estimator's, in the capture's frame; see networks/li_ne_net.py for the
         distributions. A pixel that is dark under every light is left unchanged. The mask (H, W) has
         P true pixels. Only the brightness of the observations (P, F) is used here: `lighting_at`
-        gives the observations and the light directions of some pixels. For the removed blur, see
-        remove_blur. `progress` is called after each tile with the number of its pixels.
+        gives the observations and the light directions of some pixels. `progress` is called after
+        each tile with the number of its pixels.
         """
         middle = lighting_at(np.array([len(normals) // 2])).directions  # the lights at one pixel
         capture = _Capture(
@@ -134,7 +132,6 @@ class NetworkRefiner:
             errors,
             brightness(torch.from_numpy(observations)),
             alternating_signs(self._tensor(middle).view(-1, 3)),
-            removed_blur or 0.0,
         )
         self._refine(capture, progress)
 
@@ -153,7 +150,6 @@ class NetworkRefiner:
                     lighting_at=half.lighting_at,
                     normals=half.normals,
                     errors=half.errors,
-                    removed_blur=capture.removed_blur / 2,
                 )
                 self._refine(smaller)
         # NumPy takes ten times as long.
@@ -204,7 +200,6 @@ class NetworkRefiner:
                 self._tensor(capture.errors[rows]),
                 capture.reference,
                 capture.signs,
-                removed_blur=capture.removed_blur,
             )
 
         # With one thread for each part, the results do not depend on the number of threads.

@@ -294,7 +294,7 @@ def photograph_captures(
     own = torch.Generator().manual_seed(seed)
     for capture in range(captures):
         rows, lights = slice(capture, None, captures), slice(0, int(valid[capture].sum()))
-        seen, found, factor, _ = photograph_scene(
+        seen, found, factor = photograph_scene(
             radiance[rows, lights].cpu(), directions[capture, lights].cpu(), config, own
         )
         observations[rows, lights], calibrated[rows, lights] = (
@@ -311,10 +311,9 @@ class Photographs(NamedTuple):
     observations: Tensor  # (P, F), divided by the intensities
     light_directions: Tensor  # (F, 3), unit, as calibrated
     exposure: float  # the factor from the radiance to the observations
-    removed_blur: float | None  # see remove_blur
 
 
-def photograph_scene(  # noqa: PLR0915 - one fault after the other, as in a camera
+def photograph_scene(
     radiance: Tensor,
     directions: Tensor,
     config: CaptureConfig,
@@ -394,10 +393,9 @@ def photograph_scene(  # noqa: PLR0915 - one fault after the other, as in a came
     if uniform() < 0.3 * config.light_intensity_error_share:
         errors = errors * 2 ** (uniform(0, 0.5) * torch.randn(1, lights, generator=generator))
     observed = exposed * errors / intensities
-    removed = None
     if mask is not None and around is not None:
         values = observed.contiguous().numpy()
-        removed = remove_blur(values, mask.numpy(), around.numpy())
+        remove_blur(values, mask.numpy(), around.numpy())
         pixels = slice(0, int(mask.sum()))
         observed, clipped = torch.from_numpy(values)[pixels], clipped[pixels]
     calibrated = batches.disturb_light_directions(
@@ -407,7 +405,7 @@ def photograph_scene(  # noqa: PLR0915 - one fault after the other, as in a came
         values = observed.contiguous().numpy()
         restore_saturated(values, clipped.numpy(), calibrated.double().numpy())
         observed = torch.from_numpy(values)
-    return Photographs(observed.contiguous(), calibrated, exposure, removed)
+    return Photographs(observed.contiguous(), calibrated, exposure)
 
 
 def _ambient(radiance: Tensor, share: float, uniform: Callable[..., float]) -> Tensor:

@@ -73,9 +73,6 @@ class TrainingConfig:
     # weight of the error of the differences between neighbours beside the angle, for the refinement
     # nets
     detail_weight: NotNegative = 1.0
-    # additional weight of a pixel for the refinement nets, times the largest difference of its
-    # normal to a neighbour's
-    edge_weight: NotNegative = 0.0
     # symmetric_weight, asymmetric_weight: lambda_s and lambda_a, the weights of Ls and La
     symmetric_weight: NotNegative = 0.0
     asymmetric_weight: NotNegative = 0.0

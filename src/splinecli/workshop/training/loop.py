@@ -16,9 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
@@ -172,18 +170,13 @@ def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
 
 
 def start_network(weights: str, network: SplineNet) -> None:
-    """Copy weights into the network, which may have additional parts.
-
-    These may be an error head, refinement nets or context. Refinement nets may also be larger than
-    those of the weights; initially, their result is the same.
+    """Copy weights into the network, which may also have an error head, refinement nets or
+    context.
     """
     loaded = resolve_weights(weights).network
     wanted, found = network.config.to_dict(), loaded.config.to_dict()
     for name in wanted:
         added = name in ("sees_capture", "refines_twice") and wanted[name]
-        added |= name.startswith("refine_") and (
-            not found["refines"] or _covers(wanted[name], found[name])
-        )
         if wanted[name] != found[name] and name not in ("error_head", "refines") and not added:
             problem = f"with {name} = {found[name]!r}, the run's has {wanted[name]!r}"
             raise ModelError(
@@ -199,36 +192,7 @@ def start_network(weights: str, network: SplineNet) -> None:
             " one",
             hint="Train the first one with --param network.refines_twice=false",
         )
-    own = network.state_dict()
-    network.load_state_dict(
-        {
-            name: enlarged(values, own[name])
-            for name, values in loaded.state_dict().items()
-            if name in own
-        },
-        strict=False,
-    )
-
-
-def _covers(wanted: Any, found: Any) -> bool:
-    """Return whether a setting of the refinement nets, one number or several, is at least another
-    one.
-    """
-    return all(one >= other for one, other in zip(np.ravel(wanted), np.ravel(found), strict=True))
-
-
-def enlarged(values: Tensor, initial: Tensor) -> Tensor:
-    """Return the initial weights of a layer (D, C, ...) that contains another, at most equally
-    large layer.
-
-    The outputs of the other layer do not depend on the added inputs.
-    """
-    if values.shape == initial.shape:
-        return values
-    larger = initial.clone()
-    larger[: len(values)] = 0
-    larger[tuple(map(slice, values.shape))] = values.to(larger)
-    return larger
+    network.load_state_dict(loaded.state_dict(), strict=False)
 
 
 class Trainer:

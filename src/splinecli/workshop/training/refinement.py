@@ -170,7 +170,6 @@ class ScenePool:
             seen.observations,
             seen.light_directions,
             mask,
-            removed_blur=seen.removed_blur,
         )
         features, truth = _placed(features, mask), _placed(truth, mask)
         return SceneMaps(features.half(), truth.half(), mask[None].contiguous())
@@ -249,8 +248,6 @@ def pixel_features(
     observations: Tensor,
     light_directions: Tensor,
     mask: Tensor,
-    *,
-    removed_blur: float | None = None,
 ) -> Tensor:
     """Return the refinement net's features (P, FEATURE_CHANNELS) for the pixels of a mask (H, W).
 
@@ -277,9 +274,7 @@ def pixel_features(
     def features_of(rows: PixelIndices) -> Tensor:
         values = lighting_at(rows).observations, estimated[rows], errors[rows]
         seen, normals, error = (torch.from_numpy(part).to(lights.device) for part in values)
-        return refine_features(
-            seen, lights, normals, error, reference, signs, removed_blur=removed_blur
-        )
+        return refine_features(seen, lights, normals, error, reference, signs)
 
     return torch.cat([features_of(rows) for rows in parts_of_pixels(len(observations))])
 
@@ -315,18 +310,16 @@ def refinement_losses(
     maps: SceneMaps,
     *,
     detail_weight: float = 0.0,
-    edge_weight: float = 0.0,
     bfloat16: bool = False,
 ) -> RefinementLosses:
     """Return the losses of stacked captures.
 
-    The error of each capture is its mean angle, in which a pixel at an edge has a weight of 1 plus
-    `edge_weight` times the largest difference between its true normal and a neighbour's; plus
-    `detail_weight` times the mean error of the differences between neighbours. Wrong lights rotate
-    all normals of a surface in the same way, which hides the sharpness of detail in the angles, but
-    not in these differences. The error is divided by the square root of the capture's mean angle
-    before refinement, so a degree has more weight in a capture that is already accurate. The
-    likelihood of the errors is the same as for the error head.
+    The error of each capture is its mean angle, plus `detail_weight` times the mean error of the
+    differences between neighbours. Wrong lights rotate all normals of a surface in the same way,
+    which hides the sharpness of detail in the angles, but not in these differences. The error is
+    divided by the square root of the capture's mean angle before refinement, so a degree has more
+    weight in a capture that is already accurate. The likelihood of the errors is the same as for
+    the error head.
     """
     assert network.refine_net is not None, "TrainingConfig asks for a refinement net"
     with torch.autocast(maps.features.device.type, dtype=torch.bfloat16, enabled=bfloat16):
@@ -353,26 +346,5 @@ def refinement_losses(
         )
         off = (normals - maps.normals).diff(dim=axis + 1).square().sum(dim=1).add(1e-8).sqrt()
         detail = detail + mean_over_capture(off, both) / 2
-    weight = (
-        1 + edge_weight * _largest_step(maps.normals, known)
-        if edge_weight
-        else torch.ones_like(angle)
-    )
-    of_edges = mean_over_capture(angle * weight) / mean_over_capture(weight).clamp(min=1e-6)
-    total = balanced(of_edges + detail_weight * detail, before) + 0.05 * surprise.mean()
+    total = balanced(after + detail_weight * detail, before) + 0.05 * surprise.mean()
     return RefinementLosses(total, before.mean(), after.mean())
-
-
-def _largest_step(normals: Tensor, known: Tensor) -> Tensor:
-    """Return the largest difference (B, H, W) between each normal (B, 3, H, W) and its known
-    neighbours.
-    """
-    largest = torch.zeros_like(normals[:, 0])
-    for axis in (1, 2):
-        size = known.shape[axis] - 1
-        both = known.narrow(axis, 1, size) & known.narrow(axis, 0, size)
-        step = normals.diff(dim=axis + 1).norm(dim=1) * both
-        for start in (0, 1):
-            part = largest.narrow(axis, start, size)
-            part.copy_(torch.maximum(part, step))
-    return largest

@@ -349,11 +349,11 @@ class RefinementTask:
             self.generator.manual_seed(stream_seed(self.config.seed, step, shard))
             maps = self.captures.draw(self.config.batch_size // self.config.shards, self.generator)
             with fixed(network, "refine_net"):
-                weights = {
-                    name: getattr(self.config, name) for name in ("detail_weight", "edge_weight")
-                }
                 found = refinement_losses(
-                    network, maps.to(self.device), **weights, bfloat16=bfloat16
+                    network,
+                    maps.to(self.device),
+                    detail_weight=self.config.detail_weight,
+                    bfloat16=bfloat16,
                 )
             yield Losses(found.total, found.angle, missing, missing, missing, missing)
 
