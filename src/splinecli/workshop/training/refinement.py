@@ -165,12 +165,7 @@ class ScenePool:
             maps, mask = pad(maps * mask, (REACH,) * 4), pad(mask, (REACH,) * 4)
         truth = torch.nn.functional.normalize(maps[-3:, mask].T, dim=1)
         seen = photograph_scene(maps[:-3].flatten(1).T, lights, self.config, generator, mask)
-        features = pixel_features(
-            self.network,
-            seen.observations,
-            seen.light_directions,
-            mask,
-        )
+        features = pixel_features(self.network, seen.observations, seen.light_directions, mask)
         features, truth = _placed(features, mask), _placed(truth, mask)
         return SceneMaps(features.half(), truth.half(), mask[None].contiguous())
 
@@ -244,10 +239,7 @@ def _enlarged(maps: Tensor, mask: Tensor, scale: float) -> tuple[Tensor, Tensor]
 
 @torch.no_grad()
 def pixel_features(
-    network: SplineNet,
-    observations: Tensor,
-    light_directions: Tensor,
-    mask: Tensor,
+    network: SplineNet, observations: Tensor, light_directions: Tensor, mask: Tensor
 ) -> Tensor:
     """Return the refinement net's features (P, FEATURE_CHANNELS) for the pixels of a mask (H, W).
 
@@ -306,11 +298,7 @@ class RefinementLosses(NamedTuple):
 
 
 def refinement_losses(
-    network: SplineNet,
-    maps: SceneMaps,
-    *,
-    detail_weight: float = 0.0,
-    bfloat16: bool = False,
+    network: SplineNet, maps: SceneMaps, *, detail_weight: float = 0.0, bfloat16: bool = False
 ) -> RefinementLosses:
     """Return the losses of stacked captures.
 
