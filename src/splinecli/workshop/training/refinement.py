@@ -17,7 +17,7 @@ from safetensors.torch import save
 from torch import Tensor
 from torch.nn.functional import pad
 
-from splinecli import __version__
+from splinecli._version import __version__
 from splinecli.estimate.fits.least_squares import alternating_signs
 from splinecli.estimate.inference import estimate_pixels
 from splinecli.estimate.methods.batched import NetworkEstimator
