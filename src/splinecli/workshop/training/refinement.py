@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from safetensors.torch import save
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -38,6 +37,7 @@ from splinecli.system.machine import choose_precision
 from splinecli.system.publishing import refuse_link
 from splinecli.system.weight_files import read_tensors, tensors_sha256
 from splinecli.workshop.pixel_sets.store import Entry, PixelSet
+from splinecli.workshop.save_weights import serialise
 from splinecli.workshop.synthesis import stream_seed
 from splinecli.workshop.synthesis.batches import CaptureConfig
 from splinecli.workshop.synthesis.lights import choose_in_cone, draw_light_directions
@@ -193,7 +193,7 @@ class CaptureFolder:
         if not path.exists():
             tensors = self.pool.photograph(self.count)._asdict()
             metadata = {"format": CAPTURE_FORMAT, "tensors_sha256": tensors_sha256(tensors)}
-            write_bytes(path, save(tensors, metadata))
+            write_bytes(path, serialise(tensors, metadata))
         self.count += 1
 
     def draw(self, count: int, generator: torch.Generator) -> SceneMaps:
