@@ -10,6 +10,7 @@ The sets are those of examples/render_training_scenes.sh. `train` continues afte
 import argparse
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from splinecli.lights.light_net import LIGHT_FORMAT, LightNet, network_inputs, square_images
 from splinecli.system.files import write_bytes
-from splinecli.workshop.pixel_sets.store import Entry, PixelSet, open_pixel_set
+from splinecli.workshop.pixel_sets.store import Entry, PixelSet
 from splinecli.workshop.save_weights import save_module
 from splinecli.workshop.synthesis import draw_number, shapes, stream_seed
 from splinecli.workshop.synthesis.lights import choose_in_cone, draw_light_directions
@@ -32,7 +33,8 @@ from splinecli.workshop.synthesis.meshes import (
     triangulate,
 )
 from splinecli.workshop.synthesis.whole_capture import add_background
-from splinecli.workshop.training.tasks import split_scenes
+from splinecli.workshop.training.config import PRESETS
+from splinecli.workshop.training.tasks import open_sets
 
 HELD_SHARE = 0.04
 IMAGES_PER_STEP, MOST_CAPTURES = 96, 16
@@ -209,15 +211,11 @@ def losses(
 
 def train(sets: Sequence[Path], steps: int, output: Path) -> None:
     """Train for so many steps, and write the running average of the weights."""
-    opened = [open_pixel_set(path) for path in sets]
-    split = [split_scenes(found.entries, HELD_SHARE) for found in opened]
+    sources = dict.fromkeys(map(str, sets), 1.0)
+    opened = open_sets(replace(PRESETS["compact"], sources=sources, held_share=HELD_SHARE))
     training, held = (
-        [
-            (found, entry)
-            for found, parts in zip(opened, split, strict=True)
-            for entry in parts[part]
-        ]
-        for part in (0, 1)
+        [(found, entry) for found, entries in part.values() for entry in entries]
+        for part in (opened.training, opened.validation)
     )
     torch.manual_seed(0)
     network, average = LightNet().to(memory_format=torch.channels_last), LightNet()

@@ -251,10 +251,10 @@ def test_train_light_net(run, tmp_path, monkeypatch, rng):
     meshes.
     """
     writer = PixelSetWriter(tmp_path / "set")
-    normals, mask = ball((40, 40), 19.5, 19.5, 19)
     lights = np.float32(unit(rng.normal(size=(64, 3)) * (1, 1, 0.2) + (0, 0, 1)))
-    observations = np.float32((normals[mask] @ lights.T).clip(0))
-    for name in "ab":
+    for name, radius in (("a", 19), ("b", 18)):
+        normals, mask = ball((40, 40), 19.5, 19.5, radius)
+        observations = np.float32((normals[mask] @ lights.T).clip(0))
         writer.add(name, name, "", {}, Pixels(observations, normals[mask], lights, mask))
     writer.finish()
     monkeypatch.setattr("train_light_net.IMAGES_PER_STEP", 8)

@@ -163,8 +163,9 @@ def _estimate(
         return normals, None, False
     if estimator.refiner is not None:
         advance = clock.begin("refine", capture.n_pixels, "refining")
-        known = capture.mask, capture.observations, lighting_at
-        estimator.refiner.refine(*known, normals, errors, progress=advance)
+        estimator.refiner.refine(
+            capture.mask, capture.observations, lighting_at, normals, errors, progress=advance
+        )
     judged = correct_errors(capture, estimator, lighting_at, normals, errors)
     of_lights = (
         () if capture.light_errors_deg is None else (float(capture.light_errors_deg.mean()),)

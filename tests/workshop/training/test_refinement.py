@@ -182,9 +182,9 @@ def network_of(config):
     return SplineNet(config.network)
 
 
-def pool_of(bumpy_set, refining, seed, **changes):
+def pool_of(bumpy_set, refining, seed):
     scenes = [(bumpy_set, bumpy_set.entries, 1.0)]
-    return ScenePool(scenes, network_of(refining), replace(refining.pixels, **changes), seed)
+    return ScenePool(scenes, network_of(refining), refining.pixels, seed)
 
 
 def test_captures_of_a_pool(refining, bumpy_set, tmp_path):

@@ -60,7 +60,6 @@ def fit_normals(
 
 
 Depth = Annotated[int, Meta(ge=1, le=64)]  # each layer takes memory, whatever its size
-Width = Annotated[int, Meta(ge=1, le=4096)]
 
 
 @dataclass(frozen=True)

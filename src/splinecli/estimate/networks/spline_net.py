@@ -105,9 +105,7 @@ class SplineNet(nn.Module):
             )
         self.refine_net: RefineNet | None = None
         if config.refines:
-            self.refine_net = RefineNet(
-                twice=config.refines_twice,
-            )
+            self.refine_net = RefineNet(twice=config.refines_twice)
         cells, _ = cell_directions(config.map_size)
         inside = unit_disc(config.map_size, config.grid)
         self.register_buffer("cells", cells.view(-1, 3), persistent=False)

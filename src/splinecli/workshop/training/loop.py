@@ -169,7 +169,7 @@ def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
     )
 
 
-def start_network(weights: str, network: SplineNet) -> None:
+def _start_from(weights: str, network: SplineNet) -> None:
     """Copy weights into the network, which may also have an error head, refinement nets or
     context.
     """
@@ -231,7 +231,7 @@ class Trainer:
         torch.manual_seed(config.seed)
         self.network = SplineNet(config.network).to(device)
         if config.start_from and not resume:
-            start_network(config.start_from, self.network)
+            _start_from(config.start_from, self.network)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).eval().requires_grad_(False)
         self.optimizer = torch.optim.AdamW(
