@@ -189,7 +189,10 @@ def test_workers_render_the_same_set(run, cube):
 def test_a_mesh_that_the_camera_cannot_see(run, cube):
     put("back.obj", "v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 3 2\n")
     says = "splinecli: back.obj: no face of the mesh is visible to the camera. The camera looks"
-    run("prepare --mesh back.obj --size 16 --n-lights 20 -o set", code=3, out="", says=says)
+    arguments = "prepare --mesh back.obj --size 16 --n-lights 20 -o set"
+    run(arguments, code=3, out="", says=says)
+    # Views from behind are drawn again.
+    assert run(f"{arguments} --views 4").out.startswith("set: 36 entries")
 
 
 def test_refusals(refuse, make_capture, cycles_images):

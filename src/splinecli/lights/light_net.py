@@ -73,7 +73,7 @@ class LightNet(nn.Module):
         x = torch.relu(self.join2(_with_all(x, lights)))
         x = torch.relu(self.flat(torch.relu(self.coarse(x)).flatten(1)))
         x = torch.relu(x + self.join3(_with_all(x, lights)))
-        found = self.out(x).view(captures, lights, 6)
+        found = self.out(x).float().view(captures, lights, 6)  # bfloat16 in training
         height = softplus(found[..., 2:3] + 1)
         # The limits correspond to errors of 90 degrees and 1 degree.
         sharpness = (3 + found[..., 3]).clamp(-2.0, 8.5)

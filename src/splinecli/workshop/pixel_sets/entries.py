@@ -120,6 +120,9 @@ def add_capture(
 # Version of the renderer. Increase it when the result changes, because a set must not mix versions.
 RENDERER = 6
 
+# of a view or a group. An open surface, such as a terrain, is invisible from behind.
+_MOST_DRAWS = 20
+
 
 @dataclass(frozen=True, eq=False)
 class ScenePlan:
@@ -227,16 +230,12 @@ class ScenePlan:
         be used or nothing is visible, and UsageError if the packages of the extra `render` are not
         installed.
         """
-        mesh_file = mesh = group = None
+        mesh_file = mesh = group = grade = None
         index = position - len(self._of_mesh)
         if index < 0:
             mesh_file, _, number = self._of_mesh[position]
             # of its own random stream, so that a mesh does not change any other scene
             index = 1_000_000 + number
-            mesh = read_mesh(mesh_file)
-            if self.views:
-                others = tuple(path for path in self.meshes if path != mesh_file)
-                mesh = draw_view(mesh, others, np.random.default_rng([self.seed, index, 2]))
         elif index >= self.count:
             # In steps of the golden ratio, so that even a small set has all grades
             grade = float(
@@ -247,13 +246,20 @@ class ScenePlan:
                 % 1
             )
             index += 2_000_000 - self.count
-            group, mesh = draw_group(
-                np.random.default_rng([self.seed, index, 2]), self.meshes, grade
-            )
-        config = self._config_of(position)
-        scene = draw_scene(self.seed, index, config, mesh, self.reliefs)
-        rendered = render_scene(scene, config, progress)
-        if not rendered.mask.any():
+        config, rng = self._config_of(position), np.random.default_rng([self.seed, index, 2])
+        for _ in range(_MOST_DRAWS if self.views or grade is not None else 1):
+            if grade is not None:
+                group, mesh = draw_group(rng, self.meshes, grade)
+            elif mesh_file is not None:
+                mesh = read_mesh(mesh_file)
+                if self.views:
+                    others = tuple(path for path in self.meshes if path != mesh_file)
+                    mesh = draw_view(mesh, others, rng)
+            scene = draw_scene(self.seed, index, config, mesh, self.reliefs)
+            rendered = render_scene(scene, config, progress)
+            if rendered.mask.any():
+                break
+        else:
             raise InputError(
                 "no face of the mesh is visible to the camera",
                 path=mesh_file or self.names[position],
