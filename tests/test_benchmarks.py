@@ -20,11 +20,13 @@ from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import load_weights, resolve_weights
 from splinecli.judge.judge_net import CLASSES, JudgeNet
 from splinecli.lights.light_net import LIGHT_FORMAT, LightNet
+from splinecli.materials.material_net import MATERIAL_FORMAT, MaterialNet
 from splinecli.maths.normals import unit
 from splinecli.system.weight_files import load_module
 from splinecli.workshop.pixel_sets.store import Pixels, PixelSetWriter
 from splinecli.workshop.save_weights import save_weights
 from splinecli.workshop.synthesis.meshes import read_mesh
+from splinecli.workshop.synthesis.scenes import SceneConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 MEDALLION = str(ROOT / "examples/medallion")
@@ -269,6 +271,23 @@ def test_train_light_net(run, tmp_path, monkeypatch, rng):
     for path in (tmp_path / "shapes").iterdir():
         mesh = read_mesh(path)
         assert np.abs(mesh.vertices[:, :2]).max() <= 1 and len(mesh.faces) > 1000
+
+
+def test_train_material_net(run, tmp_path, monkeypatch):
+    """The largest observation of a matte pixel is about that of a surface facing the light, in
+    generated and in rendered captures.
+    """
+    tiny = SceneConfig(size=16, lights=40, samples=1, directions=4, bounces=1)
+    small = {"BATCHES": 2, "CAPTURES": 2, "SPHERES": 1, "NARROW": 1, "SCENES": 1, "RENDERING": tiny}
+    for name, value in small.items():
+        monkeypatch.setattr(f"train_material_net.{name}", value)
+    paths = run(f"train_material_net draw {tmp_path} --shards 4").split()
+    for path in (paths[0], paths[2]):
+        roughness, metallic, log_base, *_ = load_file(path)["targets"].reshape(-1, 6).T
+        matte = log_base[(metallic == 0) & (roughness > 0.6)]
+        assert len(matte) > 100 and abs(np.median(matte)) < 0.2 and matte.std() < 0.8
+    assert run(f"train_material_net train {tmp_path} --steps 500").startswith("500 roughness 0.")
+    load_module(MaterialNet(), tmp_path / "material-net", MATERIAL_FORMAT)
 
 
 def test_train_judge_net(run, tmp_path, coarse_shapes, monkeypatch, rng):
