@@ -141,7 +141,7 @@ def test_the_refinement_net_learns_to_smooth_and_nothing_else_learns(refining, t
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_a_second_refinement_net_follows_one_that_is_trained(refining, tmp_path):
+def test_a_second_refinement_net_follows_one_that_is_trained(refining, tiny, tmp_path):
     Trainer(replace(refining, steps=5), tmp_path / "first", CPU).run()
     start_from = str(tmp_path / "first" / WEIGHTS)
     twice = replace(
@@ -163,6 +163,8 @@ def test_a_second_refinement_net_follows_one_that_is_trained(refining, tmp_path)
             tmp_path / "third",
             CPU,
         )
+    pixelwise = replace(tiny, start_from=str(tmp_path / "second" / WEIGHTS))
+    assert Trainer(pixelwise, tmp_path / "alone", CPU).network.refine_net is None
     save_weights(
         SplineNet(replace(refining.network, refines=False)), tmp_path / "without.safetensors"
     )

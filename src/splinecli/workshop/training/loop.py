@@ -171,13 +171,15 @@ def learning_rate(config: TrainingConfig, step: int, progress: float) -> float:
 
 def _start_from(weights: str, network: SplineNet) -> None:
     """Copy weights into the network, which may also have an error head, refinement nets or
-    context.
+    context, or leave the first two out.
     """
     loaded = resolve_weights(weights).network
     wanted, found = network.config.to_dict(), loaded.config.to_dict()
+    free = {"error_head", "refines"} | {n for n in ("sees_capture", "refines_twice") if wanted[n]}
+    if not wanted["refines"]:
+        free.add("refines_twice")
     for name in wanted:
-        added = name in ("sees_capture", "refines_twice") and wanted[name]
-        if wanted[name] != found[name] and name not in ("error_head", "refines") and not added:
+        if wanted[name] != found[name] and name not in free:
             problem = f"with {name} = {found[name]!r}, the run's has {wanted[name]!r}"
             raise ModelError(
                 f"the weights {weights!r} are of a network {problem}",
