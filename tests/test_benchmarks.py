@@ -249,8 +249,8 @@ def test_judgement(run, tmp_path):
 
 
 def test_train_light_net(run, tmp_path, monkeypatch, rng):
-    """It learns the lights of matte spheres, also after an interruption, and writes smooth
-    meshes.
+    """It learns the lights of matte spheres, also after an interruption, and writes smooth meshes.
+    The shipped network knows these lights.
     """
     writer = PixelSetWriter(tmp_path / "set")
     lights = np.float32(unit(rng.normal(size=(64, 3)) * (1, 1, 0.2) + (0, 0, 1)))
@@ -259,6 +259,9 @@ def test_train_light_net(run, tmp_path, monkeypatch, rng):
         observations = np.float32((normals[mask] @ lights.T).clip(0))
         writer.add(name, name, "", {}, Pixels(observations, normals[mask], lights, mask))
     writer.finish()
+    *_, row, expected = run(f"unknown_lights {tmp_path}/set --captures 1").splitlines()
+    _, answered, mean, *_ = numbers(row)
+    assert answered == 100 and mean < 5 and "100% of 3" in expected
     monkeypatch.setattr("train_light_net.IMAGES_PER_STEP", 8)
     out = tmp_path / "net.safetensors"
     errors = [
