@@ -94,9 +94,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         (found, entry) for found in map(open_pixel_set, options.sets) for entry in found.entries
     ]
     rows: dict[str, list[Row]] = {}
-    for number in range(options.captures):
-        # A step that shares no factor with the number of entries visits all scenes and materials.
-        pixel_set, entry = scenes[number * 7919 % len(scenes)]
+    order = np.random.default_rng(0).permutation(len(scenes))[: options.captures]
+    for number, (pixel_set, entry) in enumerate(scenes[place] for place in order):
         generator = torch.Generator().manual_seed(number)
         row = judge(pixel_set, entry, options.lights, generator)
         rows.setdefault(entry.source.removeprefix("rendered: "), []).append(row)
