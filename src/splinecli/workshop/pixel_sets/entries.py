@@ -236,6 +236,8 @@ class ScenePlan:
             mesh_file, _, number = self._of_mesh[position]
             # of its own random stream, so that a mesh does not change any other scene
             index = 1_000_000 + number
+            given = mesh = read_mesh(mesh_file)
+            others = tuple(path for path in self.meshes if path != mesh_file)
         elif index >= self.count:
             # In steps of the golden ratio, so that even a small set has all grades
             grade = float(
@@ -250,11 +252,8 @@ class ScenePlan:
         for _ in range(_MOST_DRAWS if self.views or grade is not None else 1):
             if grade is not None:
                 group, mesh = draw_group(rng, self.meshes, grade)
-            elif mesh_file is not None:
-                mesh = read_mesh(mesh_file)
-                if self.views:
-                    others = tuple(path for path in self.meshes if path != mesh_file)
-                    mesh = draw_view(mesh, others, rng)
+            elif mesh_file is not None and self.views:
+                mesh = draw_view(given, others, rng)
             scene = draw_scene(self.seed, index, config, mesh, self.reliefs)
             rendered = render_scene(scene, config, progress)
             if rendered.mask.any():
