@@ -1,5 +1,5 @@
 #!/bin/sh
-# Render the scenes that the weights of spline-net are trained on, about 1,900, in sets of up to an hour on one core:
+# Render the scenes that the weights of spline-net are trained on, about 1,800, in sets of up to an hour on one core:
 #
 #     sh examples/render_training_scenes.sh FOLDER SHAPES RELIEF [SET...]
 #

@@ -1,37 +1,67 @@
 #!/bin/sh
 # Repeat the run that made the weights of spline-net that come with splinecli:
 #
-#     sh examples/train_shipped_weights.sh FOLDER SHAPES RELIEF [scratch]
+#     sh examples/train_shipped_weights.sh FOLDER SHAPES RELIEF [scratch | next]
 #
 # SHAPES is a folder with the meshes of CREDITS.md (.ply), RELIEF one with its tileable normal maps (.jpg). Needs the
 # extra 'render' (pip install -c constraints.txt '.[render]') and a clone with its history, because the last run starts
 # from earlier weights. With 'scratch', it trains those as well as cnn-ps, in an estimated eighteen hours on two cores.
-# If it is interrupted, the same command continues. See MODEL_CARD.md.
+# With 'next', it continues the shipped weights with the runs in progress of docs/training-history.md, in an estimated
+# ten hours. If it is interrupted, the same command continues. See MODEL_CARD.md.
 set -eu
 folder=${1:?name a folder for the scenes and the runs}
 shapes=${2:?name the folder of the meshes}
 relief=${3:?name the folder of the normal maps}
 splinecli=${SPLINECLI:-splinecli}
 python=${PYTHON:-python}
+here=$(dirname "$0")
 fail() {
   echo "$0: $1" >&2
   exit 1
 }
-case ${4:-} in '' | scratch) ;; *) fail "found $4, expected 'scratch' or nothing" ;; esac
+case ${4:-} in '' | scratch | next) ;; *) fail "found $4, expected 'scratch', 'next' or nothing" ;; esac
 "$python" -c 'import splinecli' || fail "activate the environment of splinecli, or set PYTHON"
 [ -e "$shapes/boat.ply" ] || fail "found no boat.ply in $shapes, expected the meshes of CREDITS.md"
 ls "$relief"/*.jpg > /dev/null 2>&1 || fail "found no .jpg in $relief, expected the normal maps of CREDITS.md"
 mkdir -p "$folder"
 
+train() { "$splinecli" train "$@"; }
 # Resume a run that was interrupted; skip a run that is finished.
 run() {
   name=$1
   shift
   if [ -e "$folder/$name/finished" ]; then return; fi
   if [ -e "$folder/$name/checkpoint.safetensors" ]; then set -- "$@" --resume; fi
-  "$splinecli" train "$@" -o "$folder/$name"
+  train "$@" -o "$folder/$name"
   touch "$folder/$name/finished"
 }
+combine() { "$python" "$here/../benchmarks/combine_weights.py" "$@"; }
+# Render sets of scenes, and list their folders in `sets`.
+render() {
+  sh "$here/render_training_scenes.sh" "$folder" "$shapes" "$relief" "$@"
+  sets=
+  for name in "$@"; do sets="$sets $folder/$name"; done
+}
+
+if [ "${4:-}" = next ]; then
+  # The pixelwise networks, then their error head. `sets` is split at spaces.
+  render fine-00 groups-00 groups-01 groups-02 groups-03 groups-04 groups-05 groups-06 groups-07 groups-08 large-00 \
+    large-01 random-00 random-01 views-00
+  run pixelwise $sets --preset compact --generator-weight 10 --steps 48000 --seed 11 --param learning_rate=8e-4 \
+    --start-from spline-net
+  run errors $sets --preset compact --generator-weight 10 --steps 4000 --param learning_rate=1e-3 \
+    --param network.error_head=true --param updates=error_head --start-from "$folder/pixelwise/weights.safetensors"
+  # The refinement nets on scenes that these networks were not trained on, in two processes, which have captures of
+  # their own.
+  render groups-09 groups-10 random-02 random-03 views-01
+  joined=$folder/joined.safetensors
+  combine join "$folder/errors/weights.safetensors" spline-net "$joined"
+  train() { "$python" -m torch.distributed.run --nproc-per-node 2 -m splinecli train "$@"; }
+  run refined $sets --preset refine --steps 4200 --seed 31 --param learning_rate=2e-4 --param first_captures=200 \
+    --param shards=2 --start-from "$joined"
+  echo "$folder/refined/weights.safetensors"
+  exit
+fi
 
 start=$folder/start${4:-}.safetensors
 if [ "${4:-}" = scratch ]; then
@@ -52,7 +82,7 @@ if [ "${4:-}" = scratch ]; then
   cp "$folder/spline-net-4/weights.safetensors" "$start"
 elif [ ! -e "$start" ]; then
   # The weights after run 25 of docs/training-history.md.
-  git -C "$(dirname "$0")" show 0f312d98fe0c1a14ff44c5f8e2ca09a7218d5f43:src/splinecli/assets/spline-net.safetensors \
+  git -C "$here" show 0f312d98fe0c1a14ff44c5f8e2ca09a7218d5f43:src/splinecli/assets/spline-net.safetensors \
     > "$start.part" || fail "needs a clone with its history: git fetch --unshallow"
   mv "$start.part" "$start"
 fi
@@ -69,8 +99,7 @@ run "optics${4:-}" "$folder/random" "$folder/views" --preset refine --start-from
   --param learning_rate=1e-4 --param pixels.optics_share=0.5
 
 # The mean of start and end is better on unseen scenes than either of them.
-"$python" "$(dirname "$0")/../benchmarks/combine_weights.py" mean "$start" "$folder/optics${4:-}/weights.safetensors" \
-  "$folder/weights.safetensors"
+combine mean "$start" "$folder/optics${4:-}/weights.safetensors" "$folder/weights.safetensors"
 echo "$folder/weights.safetensors"
 
 # The material net reads the tokens of the spline-net in the package, so put the new weights there first. These
