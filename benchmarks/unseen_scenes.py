@@ -15,21 +15,24 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import resolve_weights
 from splinecli.maths import Floats
 from splinecli.workshop.pixel_sets.store import open_pixel_set
 from splinecli.workshop.training.config import PRESETS
-from splinecli.workshop.training.refinement import ScenePool, refinement_losses, stack_maps
+from splinecli.workshop.training.refinement import (
+    SceneMaps,
+    ScenePool,
+    refinement_losses,
+    stack_maps,
+)
 
 
 @torch.no_grad()
-def errors_deg(pool: ScenePool, captures: int) -> Floats:
+def errors_deg(network: SplineNet, captures: Sequence[SceneMaps]) -> Floats:
     """Return the mean errors of captures before and after refinement (N, 2)."""
-    found = []
-    for number in range(captures):
-        losses = refinement_losses(pool.network, stack_maps([pool.photograph(number)]))
-        found.append((math.degrees(losses.before), math.degrees(losses.angle)))
-    return np.array(found)
+    losses = [refinement_losses(network, stack_maps([capture])) for capture in captures]
+    return np.degrees([(found.before, found.angle) for found in losses])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -43,11 +46,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     opened = [open_pixel_set(path) for path in options.sets]
     scenes = [(found, found.entries, float(len(found.entries))) for found in opened]
+    # by the pixelwise networks, because several weights may differ only in the refinement nets
+    captures: dict[str, list[SceneMaps]] = {}
     first = None
     for weights in options.weights:
         network = resolve_weights(weights).network.eval()
         pool = ScenePool(scenes, network, PRESETS["refine"].pixels, options.seed)
-        found = errors_deg(pool, options.captures)
+        pixelwise = pool.sha256()
+        if pixelwise not in captures:
+            captures[pixelwise] = [pool.photograph(number) for number in range(options.captures)]
+        found = errors_deg(network, captures[pixelwise])
         first = found if first is None else first
         print(weights)
         for stage, errors, before in zip(("pixelwise", "refined"), found.T, first.T, strict=True):
