@@ -57,7 +57,7 @@ if [ "${4:-}" = next ]; then
   joined=$folder/joined.safetensors
   combine join "$folder/errors/weights.safetensors" spline-net "$joined"
   train() { "$python" -m torch.distributed.run --nproc-per-node 2 -m splinecli train "$@"; }
-  run refined $sets --preset refine --steps 4200 --seed 31 --param learning_rate=2e-4 --param first_captures=200 \
+  run refined $sets --preset refine --steps 3200 --seed 31 --param learning_rate=2e-4 --param first_captures=200 \
     --param shards=2 --start-from "$joined"
   echo "$folder/refined/weights.safetensors"
   exit
