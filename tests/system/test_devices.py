@@ -45,7 +45,7 @@ def test_automatic_precision_agrees_with_the_kernel_s_list_of_instructions():
     flags = set(listing.read_text().split()) if listing.exists() else set()
     if "flags" not in flags or not hasattr(torch.cpu, "get_capabilities"):
         pytest.skip("only x86 Linux lists its instructions so, and only torch from 2.10 knows them")
-    native = bool({"avx512_bf16", "amx_bf16"} & flags)
+    native = "amx_bf16" in flags or ("avx512_bf16" in flags and "GenuineIntel" not in flags)
     assert choose_precision("auto", torch.device("cpu")) == ("bfloat16" if native else "float32")
 
 
@@ -55,10 +55,28 @@ def test_automatic_precision_agrees_with_the_kernel_s_list_of_instructions():
 )
 def test_automatic_precision_respects_the_limit_of_onednn(limit, has_bfloat16, monkeypatch):
     """Emulated, bfloat16 takes more than twice as long as float32."""
-    found = {"avx512_bf16": True}
+    found = {"amx_bf16": True}
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: found, raising=False)
     monkeypatch.setenv("DNNL_MAX_CPU_ISA", limit)
     expected = "bfloat16" if has_bfloat16 else "float32"
+    assert choose_precision("auto", torch.device("cpu")) == expected
+
+
+@parametrize(
+    "found, expected",
+    [
+        ({"avx512_bf16": True, "cpu_name": "AMD EPYC 9654"}, "bfloat16"),
+        ({"avx512_bf16": True, "cpu_name": "Intel Xeon"}, "float32"),
+        ({"avx512_bf16": True, "amx_bf16": True, "cpu_name": "Intel Xeon"}, "bfloat16"),
+        ({"bf16": True}, "bfloat16"),
+        ({}, "float32"),
+    ],
+)
+def test_automatic_precision_is_the_faster_one(found, expected, monkeypatch):
+    """Intel processors without AMX are slower in bfloat16."""
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: found, raising=False)
+    for name in ("ONEDNN", "DNNL"):
+        monkeypatch.delenv(f"{name}_MAX_CPU_ISA", raising=False)
     assert choose_precision("auto", torch.device("cpu")) == expected
 
 

@@ -94,11 +94,12 @@ def expected_seconds(
 
 
 def _has_bfloat16() -> bool:
-    """Return whether the processor supports bfloat16, without importing PyTorch, which takes longer
-    than all of `info`.
+    """Return whether the processor computes in bfloat16 as in `choose_precision`, without importing
+    PyTorch, which takes longer than all of `info`.
     """
     try:
         text = Path("/proc/cpuinfo").read_text("utf-8")
     except OSError:
         return False
-    return "_bf16" in text or " bf16" in text
+    only_amx = "GenuineIntel" in text
+    return "amx_bf16" in text or " bf16" in text or ("avx512_bf16" in text and not only_amx)

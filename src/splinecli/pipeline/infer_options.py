@@ -122,7 +122,7 @@ PrecisionName = Annotated[
     Precision,
     Option(
         "Speed",
-        "float32, bfloat16, or auto: bfloat16 if the hardware supports it.",
+        "float32, bfloat16, or auto: bfloat16 if the hardware computes faster in it.",
         "FORMAT",
     ),
 ]
