@@ -99,17 +99,14 @@ class Bench:
         return means(found, lambda r: f"{r['light_noise_deg']:g}")
 
     def refined_lights(self, method: str) -> Cells:
-        cells: Cells = {}
-        for how, refine in (("given", False), ("refined", True)):
-            found = self.errors(
-                f"refined-{how}",
-                self.objects,
-                method,
-                light_noise_deg=(0.0, 4.0, 8.0),
-                refine_lights=refine,
-            )
-            cells |= means(found, lambda r, how=how: f"{r['light_noise_deg']:g} {how}")
-        return cells
+        found = self.errors(
+            "refined", self.objects, method, light_noise_deg=(0.0, 4.0, 8.0), refine_lights=True
+        )
+        refined = means(found, lambda r: f"{r['light_noise_deg']:g} refined")
+        given = self.noise(method)
+        return {
+            name.replace("refined", "given"): given[name.split()[0]] for name in refined
+        } | refined
 
     def eight_bits(self, convert: Callable[[Any], Any], name: str) -> Cells:
         """Score copies of the captures whose images have other bits,

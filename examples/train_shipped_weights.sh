@@ -1,13 +1,13 @@
 #!/bin/sh
-# Repeat the run that made the weights of spline-net that come with splinecli:
+# Repeat the runs that made the weights of spline-net that come with splinecli:
 #
-#     sh examples/train_shipped_weights.sh FOLDER SHAPES RELIEF [scratch | next]
+#     sh examples/train_shipped_weights.sh FOLDER SHAPES RELIEF [scratch]
 #
 # SHAPES is a folder with the meshes of CREDITS.md (.ply), RELIEF one with its tileable normal maps (.jpg). Needs the
-# extra 'render' (pip install -c constraints.txt '.[render]') and a clone with its history, because the last run starts
-# from earlier weights. With 'scratch', it trains those as well as cnn-ps, in an estimated eighteen hours on two cores.
-# With 'next', it continues the shipped weights with the runs in progress of docs/training-history.md, in an estimated
-# ten hours. If it is interrupted, the same command continues. See MODEL_CARD.md.
+# extra 'render' (pip install -c constraints.txt '.[render]') and a clone with its history, because the runs start from
+# earlier weights. They take an estimated ten hours on two cores. With 'scratch', it first trains replacements of the
+# earlier weights, and cnn-ps, in an estimated seventeen hours more. If it is interrupted, the same command continues.
+# See MODEL_CARD.md.
 set -eu
 folder=${1:?name a folder for the scenes and the runs}
 shapes=${2:?name the folder of the meshes}
@@ -19,20 +19,20 @@ fail() {
   echo "$0: $1" >&2
   exit 1
 }
-case ${4:-} in '' | scratch | next) ;; *) fail "found $4, expected 'scratch', 'next' or nothing" ;; esac
+case ${4:-} in '' | scratch) ;; *) fail "found $4, expected 'scratch' or nothing" ;; esac
 "$python" -c 'import splinecli' || fail "activate the environment of splinecli, or set PYTHON"
 [ -e "$shapes/boat.ply" ] || fail "found no boat.ply in $shapes, expected the meshes of CREDITS.md"
 ls "$relief"/*.jpg > /dev/null 2>&1 || fail "found no .jpg in $relief, expected the normal maps of CREDITS.md"
 mkdir -p "$folder"
 
-train() { "$splinecli" train "$@"; }
+processes=1
 # Resume a run that was interrupted; skip a run that is finished.
 run() {
   name=$1
   shift
   if [ -e "$folder/$name/finished" ]; then return; fi
   if [ -e "$folder/$name/checkpoint.safetensors" ]; then set -- "$@" --resume; fi
-  train "$@" -o "$folder/$name"
+  "$python" -m torch.distributed.run --nproc-per-node "$processes" -m splinecli train "$@" -o "$folder/$name"
   touch "$folder/$name/finished"
 }
 combine() { "$python" "$here/../benchmarks/combine_weights.py" "$@"; }
@@ -42,28 +42,6 @@ render() {
   sets=
   for name in "$@"; do sets="$sets $folder/$name"; done
 }
-
-if [ "${4:-}" = next ]; then
-  # The pixelwise networks, then their error head. `sets` is split at spaces.
-  render fine-00 groups-00 groups-01 groups-02 groups-03 groups-04 groups-05 groups-06 groups-07 groups-08 large-00 \
-    large-01 random-00 random-01 views-00
-  run pixelwise $sets --preset compact --generator-weight 10 --steps 48000 --seed 11 --param learning_rate=8e-4 \
-    --start-from spline-net
-  run errors $sets --preset compact --generator-weight 10 --steps 4000 --param learning_rate=1e-3 \
-    --param network.error_head=true --param updates=error_head --start-from "$folder/pixelwise/weights.safetensors"
-  # The refinement nets on scenes that these networks were not trained on, in two processes, which have captures of
-  # their own.
-  render groups-09 groups-10 random-02 random-03 views-01
-  joined=$folder/joined.safetensors
-  combine join "$folder/errors/weights.safetensors" spline-net "$joined"
-  train() { "$python" -m torch.distributed.run --nproc-per-node 2 -m splinecli train "$@"; }
-  run refined $sets --preset refine --steps 3200 --seed 31 --param learning_rate=2e-4 --param first_captures=200 \
-    --param shards=2 --start-from "$joined"
-  # The mean of start and end is better on unseen scenes than either of them.
-  combine mean "$joined" "$folder/refined/weights.safetensors" "$folder/weights.safetensors"
-  echo "$folder/weights.safetensors"
-  exit
-fi
 
 start=$folder/start${4:-}.safetensors
 if [ "${4:-}" = scratch ]; then
@@ -83,28 +61,33 @@ if [ "${4:-}" = scratch ]; then
     --start-from "$folder/cnn-ps-1/weights.safetensors"
   cp "$folder/spline-net-4/weights.safetensors" "$start"
 elif [ ! -e "$start" ]; then
-  # The weights after run 25 of docs/training-history.md.
-  git -C "$here" show 0f312d98fe0c1a14ff44c5f8e2ca09a7218d5f43:src/splinecli/assets/spline-net.safetensors \
+  # The weights after run 27 of docs/training-history.md.
+  git -C "$here" show e1a8d46809746c318b7a58fe676dc158ade36d09:src/splinecli/assets/spline-net.safetensors \
     > "$start.part" || fail "needs a clone with its history: git fetch --unshallow"
   mv "$start.part" "$start"
 fi
 
-# 80 random shapes, and three random views of each of 19 meshes, relief on half of the scenes. The other two meshes are
-# those of the statues in docs/robustness.md.
-set --
-for map in "$relief"/*.jpg; do set -- "$@" --relief "$map"; done
-"$splinecli" prepare --scenes 80 --seed 202 "$@" -o "$folder/random"
-for name in boat boot cat dancing-girl demosthenes fish goathead hammer koala mountain penguin pizza plane scorpion \
-  skull spot sword torus wingnut; do set -- "$@" --mesh "$shapes/$name.ply"; done
-"$splinecli" prepare --views 3 --seed 201 "$@" -o "$folder/views"
-run "optics${4:-}" "$folder/random" "$folder/views" --preset refine --start-from "$start" --seed 3 --steps 781 \
-  --param learning_rate=1e-4 --param pixels.optics_share=0.5
+# The pixelwise networks, then their error head. `sets` is split at spaces.
+render fine-00 groups-00 groups-01 groups-02 groups-03 groups-04 groups-05 groups-06 groups-07 groups-08 large-00 \
+  large-01 random-00 random-01 views-00
+run "pixelwise${4:-}" $sets --preset compact --generator-weight 10 --steps 48000 --seed 11 \
+  --param learning_rate=8e-4 --start-from "$start"
+run "errors${4:-}" $sets --preset compact --generator-weight 10 --steps 4000 --param learning_rate=1e-3 \
+  --param network.error_head=true --param updates=error_head --start-from "$folder/pixelwise${4:-}/weights.safetensors"
+
+# The refinement nets on scenes that these networks were not trained on, in two processes, which have captures of their
+# own.
+render groups-09 groups-10 random-02 random-03 views-01
+joined=$folder/joined${4:-}.safetensors
+combine join "$folder/errors${4:-}/weights.safetensors" "$start" "$joined"
+processes=2
+run "refined${4:-}" $sets --preset refine --steps 3200 --seed 31 --param learning_rate=2e-4 \
+  --param first_captures=200 --param shards=2 --start-from "$joined"
 
 # The mean of start and end is better on unseen scenes than either of them.
-combine mean "$start" "$folder/optics${4:-}/weights.safetensors" "$folder/weights.safetensors"
+combine mean "$joined" "$folder/refined${4:-}/weights.safetensors" "$folder/weights.safetensors"
 echo "$folder/weights.safetensors"
 
-# The material net reads the tokens of the spline-net in the package, so put the new weights there first. These
-# tokens change only with a new start.
+# The material net reads the tokens of the spline-net in the package, so put the new weights there first.
 #   python benchmarks/train_material_net.py draw "$folder/material"
 #   python benchmarks/train_material_net.py train "$folder/material" --ship

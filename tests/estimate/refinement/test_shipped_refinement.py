@@ -52,13 +52,13 @@ def refined_and_not(*surface, **faults):
     return refined, estimate_normals(capture, make_estimator("spline-net-pixelwise"))
 
 
-@parametrize("noise, most_tilted_deg", [(0.01, 0.3), (0.03, 0.75)])
-def test_a_noisy_plate_stays_as_flat_as_it_is(noise, most_tilted_deg):
+@parametrize("noise", [0.01, 0.03])
+def test_a_noisy_plate_stays_as_flat_as_it_is(noise):
     both, pixelwise = refined_and_not(PLATE, 0.5, noise=noise)
     for refined in both:
         assert refined.errors.mean < 1.05 * pixelwise.errors.mean
         mean = unit(refined.normal_map.mean(axis=(0, 1)))
-        assert float(angle_between_deg(mean, PLATE[0, 0])) < most_tilted_deg
+        assert float(angle_between_deg(mean, PLATE[0, 0])) < 0.75
 
 
 @parametrize("gloss", [0.0, 0.5])
