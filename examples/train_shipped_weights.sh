@@ -20,6 +20,7 @@ fail() {
   exit 1
 }
 case ${4:-} in '' | scratch) ;; *) fail "found $4, expected 'scratch' or nothing" ;; esac
+case $folder in *[[:space:]]*) fail "found a space in $folder, expected a path without spaces" ;; esac
 "$python" -c 'import splinecli' || fail "activate the environment of splinecli, or set PYTHON"
 [ -e "$shapes/boat.ply" ] || fail "found no boat.ply in $shapes, expected the meshes of CREDITS.md"
 ls "$relief"/*.jpg > /dev/null 2>&1 || fail "found no .jpg in $relief, expected the normal maps of CREDITS.md"
@@ -43,7 +44,9 @@ render() {
   for name in "$@"; do sets="$sets $folder/$name"; done
 }
 
-start=$folder/start${4:-}.safetensors
+# keeps the runs of the two ways apart
+of=${4:+-$4}
+start=$folder/start$of.safetensors
 if [ "${4:-}" = scratch ]; then
   scenes=$folder/scenes
   whole=$folder/whole-scenes
@@ -70,22 +73,22 @@ fi
 # The pixelwise networks, then their error head. `sets` is split at spaces.
 render fine-00 groups-00 groups-01 groups-02 groups-03 groups-04 groups-05 groups-06 groups-07 groups-08 large-00 \
   large-01 random-00 random-01 views-00
-run "pixelwise${4:-}" $sets --preset compact --generator-weight 10 --steps 48000 --seed 11 \
+run "pixelwise$of" $sets --preset compact --generator-weight 10 --steps 48000 --seed 11 \
   --param learning_rate=8e-4 --start-from "$start"
-run "errors${4:-}" $sets --preset compact --generator-weight 10 --steps 4000 --param learning_rate=1e-3 \
-  --param network.error_head=true --param updates=error_head --start-from "$folder/pixelwise${4:-}/weights.safetensors"
+run "errors$of" $sets --preset compact --generator-weight 10 --steps 4000 --param learning_rate=1e-3 \
+  --param network.error_head=true --param updates=error_head --start-from "$folder/pixelwise$of/weights.safetensors"
 
 # The refinement nets on scenes that these networks were not trained on, in two processes, which have captures of their
 # own.
 render groups-09 groups-10 random-02 random-03 views-01
-joined=$folder/joined${4:-}.safetensors
-combine join "$folder/errors${4:-}/weights.safetensors" "$start" "$joined"
+joined=$folder/joined$of.safetensors
+combine join "$folder/errors$of/weights.safetensors" "$start" "$joined"
 processes=2
-run "refined${4:-}" $sets --preset refine --steps 3200 --seed 31 --param learning_rate=2e-4 \
+run "refined$of" $sets --preset refine --steps 3200 --seed 31 --param learning_rate=2e-4 \
   --param first_captures=200 --param shards=2 --start-from "$joined"
 
 # The mean of start and end is better on unseen scenes than either of them.
-combine mean "$joined" "$folder/refined${4:-}/weights.safetensors" "$folder/weights.safetensors"
+combine mean "$joined" "$folder/refined$of/weights.safetensors" "$folder/weights.safetensors"
 echo "$folder/weights.safetensors"
 
 # The material net reads the tokens of the spline-net in the package, so put the new weights there first.

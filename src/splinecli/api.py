@@ -80,8 +80,8 @@ def estimate_normals(  # noqa: PLR0913 - keyword arguments suit a notebook
             pixels. False applies the method to every pixel; None distils from 100,000 pixels.
         batch_size: pixels per batch. None uses the method's default.
         device: where to compute; "auto" is a CUDA GPU if there is one.
-        precision: number format of a network; "auto" is bfloat16 if the device supports it
-            natively.
+        precision: number format of a network; "auto" is bfloat16 if the device computes
+            faster in it.
         progress: called with the number of pixels just finished, about every 1,000 pixels for
             networks.
 

@@ -101,5 +101,5 @@ def _has_bfloat16() -> bool:
         text = Path("/proc/cpuinfo").read_text("utf-8")
     except OSError:
         return False
-    only_amx = "GenuineIntel" in text
-    return "amx_bf16" in text or " bf16" in text or ("avx512_bf16" in text and not only_amx)
+    is_intel = "GenuineIntel" in text
+    return "amx_bf16" in text or " bf16" in text or ("avx512_bf16" in text and not is_intel)

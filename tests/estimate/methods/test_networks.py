@@ -136,7 +136,7 @@ def test_a_black_background_says_nothing_of_the_object():
     assert np.array_equal(network.estimate(0 * dark, lights), np.tile((0, 0, 1), (800, 1)))
 
 
-def test_outline_pixels_that_the_object_covers_only_in_part_do_not_affect_the_others():
+def test_outline_pixels_that_the_object_covers_only_in_part_hardly_affect_the_others():
     """They affect the others less than without context, where all pixels of a call are sampled."""
     size, factor, lights = 32, 8, spiral_lights(10)
     normals, inside = sphere(size * factor)

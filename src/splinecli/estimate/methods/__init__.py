@@ -36,7 +36,7 @@ class MethodOptions:
     # most pixels per batch. On a CPU, each core computes one batch
     batch_size: int | None = None
     device: Device = "auto"  # where to compute; "auto" is a CUDA GPU if there is one
-    # of a network; "auto" is bfloat16 if the device supports it natively
+    # of a network; "auto" is bfloat16 if the device computes faster in it
     precision: Precision = "auto"
 
 
