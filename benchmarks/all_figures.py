@@ -35,7 +35,8 @@ Cells = dict[str, float | str]
 Rows = dict[str, Callable[[], Cells]]
 """What measures each row."""
 
-WITHOUT_WEIGHTS = ("calibration", "wrong-lights")
+# do not depend on the weights of spline-net
+WITHOUT_WEIGHTS = ("calibration", "wrong-lights", "cnn-ps")
 NEED_QUIET = ("speed", "sizes")
 
 
