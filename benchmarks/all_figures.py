@@ -103,11 +103,10 @@ class Bench:
         found = self.errors(
             "refined", self.objects, method, light_noise_deg=(0.0, 4.0, 8.0), refine_lights=True
         )
-        refined = means(found, lambda r: f"{r['light_noise_deg']:g} refined")
-        given = self.noise(method)
-        return {
-            name.replace("refined", "given"): given[name.split()[0]] for name in refined
-        } | refined
+        refined, given = means(found, lambda r: f"{r['light_noise_deg']:g}"), self.noise(method)
+        return {f"{deg} given": given[deg] for deg in refined} | {
+            f"{deg} refined": error for deg, error in refined.items()
+        }
 
     def eight_bits(self, convert: Callable[[Any], Any], name: str) -> Cells:
         """Score copies of the captures whose images have other bits,
