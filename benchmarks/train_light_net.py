@@ -1,37 +1,43 @@
-"""Train the light network on pixel sets of rendered scenes.
+"""Render small scenes for the light network, and train it on them and on other pixel sets.
 
+    python benchmarks/train_light_net.py draw SET SHAPES RELIEF [--scenes 300] [--seed 0]
     python benchmarks/train_light_net.py train SET... --steps 60000 -o light-net.safetensors
-    python benchmarks/train_light_net.py shapes FOLDER
 
-The sets are those of examples/render_training_scenes.sh. `train` continues after an interruption.
-`shapes` writes spheres, ellipsoids and unions of them, for the sets smooth-*.
+SHAPES and RELIEF are the folders of examples/render_training_scenes.sh. Both continue after an
+interruption. A scene takes about three seconds on one core.
 """
 
 import argparse
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 from torch.utils.data import DataLoader, IterableDataset
 
 from splinecli.lights.light_net import LIGHT_FORMAT, LightNet, network_inputs, square_images
-from splinecli.system.files import write_bytes
-from splinecli.workshop.pixel_sets.store import Entry, PixelSet
+from splinecli.system.machine import choose_precision
+from splinecli.workshop.pixel_sets.store import Entry, Pixels, PixelSet, PixelSetWriter
 from splinecli.workshop.save_weights import save_module
 from splinecli.workshop.synthesis import draw_number, shapes, stream_seed
+from splinecli.workshop.synthesis.draw_materials import CLASSES
+from splinecli.workshop.synthesis.groups import draw_group
 from splinecli.workshop.synthesis.lights import choose_in_cone, draw_light_directions
 from splinecli.workshop.synthesis.meshes import (
     Mesh,
     ellipsoid,
     fit_to_frame,
+    read_mesh,
     smooth_union,
     triangulate,
 )
+from splinecli.workshop.synthesis.scenes import SceneConfig, draw_scene, render_scene
+from splinecli.workshop.synthesis.shapes import draw_view
 from splinecli.workshop.synthesis.whole_capture import add_background
 from splinecli.workshop.training.config import PRESETS
 from splinecli.workshop.training.tasks import open_sets
@@ -39,20 +45,47 @@ from splinecli.workshop.training.tasks import open_sets
 HELD_SHARE = 0.04
 IMAGES_PER_STEP, MOST_CAPTURES = 96, 16
 RATE = 2e-3
+RENDERING = SceneConfig(
+    size=72, lights=64, samples=2, directions=16, bounces=2, perspective_share=0.2
+)
+KINDS = tuple(CLASSES)
+KEPT_BACK = "bust-wreath", "maria"  # the statues in docs/robustness.md
 Scenes = Sequence[tuple[PixelSet, Entry]]
 
 
-def write_smooth(folder: Path, count: int, seed: int) -> None:
-    """Write smooth meshes that the folder does not have."""
-    import trimesh
+def draw(output: Path, meshes: Path, reliefs: Path, scenes: int, seed: int) -> None:
+    """Render the scenes that a set does not have, in one set of materials of each class.
 
-    folder.mkdir(parents=True, exist_ok=True)
-    for index in range(count):
-        path = folder / f"smooth{index:03}.ply"
-        if not path.exists():
-            mesh = draw_smooth(np.random.default_rng([seed, index, 77]))
-            content = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(None, "ply")
-            write_bytes(path, content)
+    40 % are groups of bodies, 15 % views of the meshes, 20 % random shapes, and 25 % smooth.
+    """
+    files = [path for path in sorted(meshes.glob("*.ply")) if path.stem not in KEPT_BACK]
+    maps = sorted(reliefs.glob("*.jpg"))
+    writer = PixelSetWriter(output)
+    for index in range(scenes):
+        name = f"scene{index:04}"
+        if f"{name}-{KINDS[-1]}" in writer:
+            continue
+        rng = np.random.default_rng([seed, index, 78])
+        number, mesh = rng.random(), None
+        if number < 0.4:
+            shape, mesh = draw_group(rng, files, rng.random())
+        elif number < 0.55:
+            place = int(rng.integers(len(files)))
+            others = files[:place] + files[place + 1 :]
+            shape, mesh = "view", draw_view(read_mesh(files[place]), others, rng)
+        elif number < 0.8:
+            shape, mesh = "smooth", draw_smooth(rng)
+        scene = draw_scene(seed, index, RENDERING, mesh, maps)
+        scene = replace(scene, materials={kind: scene.materials[kind] for kind in KINDS})
+        rendered = render_scene(scene, RENDERING)
+        if not rendered.mask.any():
+            continue
+        for kind, observations in rendered.observations.items():
+            parts = observations.astype(np.float16), rendered.normals, scene.lights, rendered.mask
+            source = f"rendered: {scene.shape if mesh is None else shape}"
+            writer.add(f"{name}-{kind}", name, source, asdict(RENDERING), Pixels(*parts))
+        print(name, source, flush=True)
+    writer.finish()
 
 
 def draw_smooth(rng: np.random.Generator) -> Mesh:
@@ -199,7 +232,8 @@ def losses(
     of the logs, and the cross entropy of bumps and hollows, of which those in between count for
     both.
     """
-    with torch.autocast("cpu", torch.bfloat16):
+    is_coarse = choose_precision("auto", torch.device("cpu")) == "bfloat16"
+    with torch.autocast("cpu", torch.bfloat16, enabled=is_coarse):
         guess = network(images.float())
     cosine = (guess.directions * directions).sum(dim=-1)
     sharpness = guess.sharpness.exp()
@@ -211,7 +245,25 @@ def losses(
     return likelihood.mean(), angle.mean(), (guess.log_intensities - intensities).abs().mean(), side
 
 
-def train(sets: Sequence[Path], steps: int, output: Path) -> None:
+def widen(network: LightNet, narrow: dict[str, Tensor]) -> None:
+    """Give a network the function of one with fewer features per layer (Chen et al., "Net2Net",
+    ICLR 2016).
+
+    Its own features do not change the features of the narrow one yet.
+    """
+    for name, values in network.state_dict().items():
+        known = narrow[name]
+        if values.ndim == 1:
+            values[: len(known)] = known
+            continue
+        groups = 3 if name.startswith("join") else 1  # of inputs: each image, maximum and mean
+        rows = values.view(len(values), groups, -1, *values.shape[2:])[: len(known)]
+        known = known.view(len(known), groups, -1, *known.shape[2:])
+        rows.zero_()
+        rows[:, :, : known.shape[2]] = known
+
+
+def train(sets: Sequence[Path], steps: int, output: Path, start_from: Path | None = None) -> None:
     """Train for so many steps, and write the running average of the weights."""
     sources = dict.fromkeys(map(str, sets), 1.0)
     opened = open_sets(replace(PRESETS["compact"], sources=sources, held_share=HELD_SHARE))
@@ -221,6 +273,10 @@ def train(sets: Sequence[Path], steps: int, output: Path) -> None:
     )
     torch.manual_seed(0)
     network, average = LightNet().to(memory_format=torch.channels_last), LightNet()
+    peak = RATE
+    if start_from is not None:
+        peak = RATE / 2
+        widen(network, load_file(start_from))
     optimiser = torch.optim.AdamW(
         network.parameters(), RATE, betas=(0.9, 0.99), weight_decay=1e-3, fused=True
     )
@@ -234,7 +290,7 @@ def train(sets: Sequence[Path], steps: int, output: Path) -> None:
     captures = Captures(training, 0, step)
     batches = iter(DataLoader(captures, batch_size=None, num_workers=1, prefetch_factor=6))
     while step < steps:
-        rate = RATE * min(1, (step + 1) / 100) * (1 + math.cos(math.pi * step / steps)) / 2 + 1e-6
+        rate = peak * min(1, (step + 1) / 100) * (1 + math.cos(math.pi * step / steps)) / 2 + 1e-6
         for group in optimiser.param_groups:
             group["lr"] = rate
         likelihood, angle, intensity, side = losses(network, *next(batches))
@@ -270,17 +326,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True)
-    drawing = commands.add_parser("shapes")
-    drawing.add_argument("folder", type=Path)
-    drawing.add_argument("--count", type=int, default=30)
+    drawing = commands.add_parser("draw")
+    for name in ("output", "meshes", "reliefs"):
+        drawing.add_argument(name, type=Path)
+    drawing.add_argument("--scenes", type=int, default=300)
     drawing.add_argument("--seed", type=int, default=0)
     training = commands.add_parser("train")
     training.add_argument("sets", type=Path, nargs="+")
     training.add_argument("--steps", type=int, default=60_000)
+    training.add_argument("--start-from", type=Path, help="weights of a network, or a narrower one")
     training.add_argument("-o", "--output", type=Path, default=Path("light-net.safetensors"))
     options = vars(parser.parse_args(arguments))
-    if options.pop("command") == "shapes":
-        write_smooth(**options)
+    if options.pop("command") == "draw":
+        draw(**options)
     else:
         train(**options)
 

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Render the scenes that the weights of spline-net are trained on, about 1,800, in sets of up to an hour on one core:
+# Render the scenes that the weights of spline-net are trained on, about 1,500, in sets of up to an hour on one core:
 #
 #     sh examples/render_training_scenes.sh FOLDER SHAPES RELIEF [SET...]
 #
@@ -12,19 +12,17 @@ shapes=${2:?name the folder of the meshes}
 relief=${3:?name the folder of the normal maps}
 shift 3
 splinecli=${SPLINECLI:-splinecli}
-python=${PYTHON:-python}
 
 numbers() { seq -f '%02g' 0 "$1"; }
 if [ $# = 0 ]; then
   set -- unseen-groups unseen-random unseen-views
   for n in $(numbers 9); do set -- "$@" "groups-$n" "groups-1$n" "groups-2$n" "random-$n" "large-$n"; done
-  for n in $(numbers 4); do set -- "$@" "fine-$n" "views-$n" "smooth-$n"; done
+  for n in $(numbers 4); do set -- "$@" "fine-$n" "views-$n"; done
 fi
 for name in "$@"; do
   number=${name##*-}
   # A number such as 08 is octal to the shell.
   number=${number#0}
-  meshes=$shapes
   case $name in
     unseen-groups) scenes="--groups 24 --seed 9001" ;;
     unseen-random) scenes="--scenes 12 --seed 9002" ;;
@@ -34,11 +32,6 @@ for name in "$@"; do
     fine-*) scenes="--groups 8 --size 256 --seed $((7200 + number))" ;;
     random-*) scenes="--scenes 30 --seed $((7300 + number))" ;;
     views-*) scenes="--views 1 --seed $((7400 + number))" ;;
-    smooth-*) # for the light network
-      scenes="--views 2 --size 96 --seed $((7500 + number))"
-      meshes=$folder/shapes-$name
-      "$python" "$(dirname "$0")/../benchmarks/train_light_net.py" shapes "$meshes" --seed $((7500 + number))
-      ;;
     *)
       echo "$0: no set named $name" >&2
       exit 2
@@ -47,7 +40,7 @@ for name in "$@"; do
   set -- $scenes
   for map in "$relief"/*.jpg; do set -- "$@" --relief "$map"; done
   # The other two meshes are those of the statues in docs/robustness.md.
-  for mesh in "$meshes"/*.ply; do
+  for mesh in "$shapes"/*.ply; do
     case $mesh:$name in
       *bust-wreath.ply:* | *maria.ply:* | *:*random*) ;;
       *) set -- "$@" --mesh "$mesh" ;;

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Repeat the runs that made the weights of spline-net that come with splinecli:
+# Repeat the runs that made the weights of spline-net and of the light network that come with splinecli:
 #
 #     sh examples/train_shipped_weights.sh FOLDER SHAPES RELIEF [scratch]
 #
@@ -36,6 +36,13 @@ run() {
   "$python" -m torch.distributed.run --nproc-per-node "$processes" -m splinecli train "$@" -o "$folder/$name"
   touch "$folder/$name/finished"
 }
+# Write weights as they were after run 27 of docs/training-history.md.
+earlier() {
+  if [ -e "$2" ]; then return; fi
+  git -C "$here" show "e1a8d46809746c318b7a58fe676dc158ade36d09:src/splinecli/assets/$1.safetensors" > "$2.part" ||
+    fail "needs a clone with its history: git fetch --unshallow"
+  mv "$2.part" "$2"
+}
 combine() { "$python" "$here/../benchmarks/combine_weights.py" "$@"; }
 # Render sets of scenes, and list their folders in `sets`.
 render() {
@@ -63,11 +70,8 @@ if [ "${4:-}" = scratch ]; then
   run cnn-ps-2 "$scenes" --preset cnn-ps --generator-weight 2 --steps 4318 --param learning_rate=6e-4 \
     --start-from "$folder/cnn-ps-1/weights.safetensors"
   cp "$folder/spline-net-4/weights.safetensors" "$start"
-elif [ ! -e "$start" ]; then
-  # The weights after run 27 of docs/training-history.md.
-  git -C "$here" show e1a8d46809746c318b7a58fe676dc158ade36d09:src/splinecli/assets/spline-net.safetensors \
-    > "$start.part" || fail "needs a clone with its history: git fetch --unshallow"
-  mv "$start.part" "$start"
+else
+  earlier spline-net "$start"
 fi
 
 # The pixelwise networks, then their error head. `sets` is split at spaces.
@@ -90,6 +94,19 @@ run "refined$of" $sets --preset refine --steps 3200 --seed 31 --param learning_r
 # The mean of start and end is better on unseen scenes than either of them.
 combine mean "$joined" "$folder/refined$of/weights.safetensors" "$folder/weights.safetensors"
 echo "$folder/weights.safetensors"
+
+# The light network, which learns from small scenes, too.
+for n in 0 1 2; do
+  "$python" "$here/../benchmarks/train_light_net.py" draw "$folder/light-$n" "$shapes" "$relief" --seed $((7500 + n))
+  sets="$sets $folder/light-$n"
+done
+set -- --steps 60000
+if [ -z "$of" ]; then
+  earlier light-net "$folder/light-start.safetensors"
+  set -- --steps 12000 --start-from "$folder/light-start.safetensors"
+fi
+"$python" "$here/../benchmarks/train_light_net.py" train $sets "$@" -o "$folder/light-net$of.safetensors"
+echo "$folder/light-net$of.safetensors"
 
 # The material net reads the tokens of the spline-net in the package, so put the new weights there first.
 #   python benchmarks/train_material_net.py draw "$folder/material"

@@ -5,6 +5,7 @@ import math
 import re
 import shutil
 import time
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,6 @@ from splinecli.maths.normals import unit
 from splinecli.system.weight_files import load_module
 from splinecli.workshop.pixel_sets.store import Pixels, PixelSetWriter
 from splinecli.workshop.save_weights import save_weights
-from splinecli.workshop.synthesis.meshes import read_mesh
 from splinecli.workshop.synthesis.scenes import SceneConfig
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -248,9 +248,10 @@ def test_judgement(run, tmp_path):
     assert run(f"judgement report {found} {found}") == printed
 
 
+@pytest.mark.usefixtures("coarse_shapes")
 def test_train_light_net(run, tmp_path, monkeypatch, rng):
-    """It learns the lights of matte spheres, also after an interruption, and writes smooth meshes.
-    The shipped network knows these lights.
+    """It renders scenes of all kinds, and learns the lights of matte spheres, also after an
+    interruption. The shipped network knows these lights, and is where training starts from.
     """
     writer = PixelSetWriter(tmp_path / "set")
     lights = np.float32(unit(rng.normal(size=(64, 3)) * (1, 1, 0.2) + (0, 0, 1)))
@@ -270,10 +271,20 @@ def test_train_light_net(run, tmp_path, monkeypatch, rng):
     ]
     assert errors[1] < 0.7 * errors[0]
     load_module(LightNet(), out, LIGHT_FORMAT)
-    run(f"train_light_net shapes {tmp_path}/shapes --count 2")
-    for path in (tmp_path / "shapes").iterdir():
-        mesh = read_mesh(path)
-        assert np.abs(mesh.vertices[:, :2]).max() <= 1 and len(mesh.faces) > 1000
+    shipped = files("splinecli") / "assets" / "light-net.safetensors"
+    options = f"--steps 1 -o {tmp_path}/known.safetensors --start-from {shipped}"
+    known = run(f"train_light_net train {tmp_path}/set {options}")
+    assert numbers(known.split()[1])[0] < errors[1]
+
+    trimesh = pytest.importorskip("trimesh")
+    tiny = SceneConfig(size=16, lights=8, samples=1, directions=4, bounces=1)
+    monkeypatch.setattr("train_light_net.RENDERING", tiny)
+    (tmp_path / "relief").mkdir()
+    trimesh.creation.icosphere(3).export(tmp_path / "mesh.ply")
+    command = f"train_light_net draw {tmp_path}/drawn {tmp_path} {tmp_path}/relief --seed 4"
+    kinds = [line.split()[-1] for line in run(f"{command} --scenes 4").splitlines()]
+    assert len(set(kinds)) == 4 and {"smooth", "view"} < set(kinds)
+    assert len(run(f"{command} --scenes 5").splitlines()) == 1
 
 
 def test_train_material_net(run, tmp_path, monkeypatch):

@@ -261,7 +261,7 @@ def test_the_outline_tells_a_bump_from_a_hollow():
 @parametrize("hollow", [False, True])
 def test_a_wrong_guess_of_the_network_is_turned_around(hollow, monkeypatch):
     lights, mask = ring_lights(10, 60), np.ones((64, 64), np.bool_)
-    guess = lights * OPPOSITE, np.full(10, 16.0), np.ones(10)
+    guess = lights * OPPOSITE, np.full(10, 16.0), np.ones(10), 1.0
     monkeypatch.setattr(unknown_lights, "_ask_network", lambda *_: guess)
     found = find_lights(cap_on_plate(64, lights, hollow=hollow), mask, True, refuse=False)
     assert angle_between_deg(found.directions, lights).mean() < 11

@@ -25,9 +25,7 @@ class LightGuess(NamedTuple):
     sharpness: Tensor  # (B, F), the logarithms of the concentrations of these distributions
     # (B, F), the logarithms of the intensities; their mean over each capture is zero
     log_intensities: Tensor
-    # (B,), the logit that the object is a bump rather than a hollow; the shipped weights were not
-    # trained to predict it
-    bump: Tensor
+    bump: Tensor  # (B,), the logit that the object is a bump rather than a hollow
 
 
 class LightNet(nn.Module):
@@ -41,7 +39,7 @@ class LightNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        fine, local, middle, coarse, joined, hidden = 24, 48, 96, 128, 64, 192
+        fine, local, middle, coarse, joined, hidden = 32, 64, 128, 192, 96, 256
         self.enter = nn.Conv2d(INPUTS, fine, 4, stride=2, padding=1)
         self.local = nn.ModuleList(
             (nn.Conv2d(fine, local, 3, stride=2, padding=1), nn.Conv2d(local, local, 3, padding=1))

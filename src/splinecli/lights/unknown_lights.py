@@ -133,11 +133,11 @@ def find_lights(
     step = max(1, math.ceil(math.sqrt(len(observations) / _MOST_PIXELS)))
     observations, mask = thin_out(observations, mask, step)
     _check_different(observations)
-    guess, errors_deg, intensities = _ask_network(observations, mask)
+    guess, errors_deg, intensities, bump = _ask_network(observations, mask)
     if intensities_known:
         intensities = np.ones_like(intensities)
     by_network, expected_deg = Lights(guess, intensities), float(errors_deg.mean())
-    first = _fit(observations, mask, by_network, errors_deg, intensities_known, refuse=refuse)
+    first = _fit(observations, mask, by_network, errors_deg, bump, intensities_known, refuse=refuse)
     starts = [first]
     for each in lights_of_least_curl(
         observations, mask, by_network, errors_deg, intensities_known=intensities_known
@@ -166,6 +166,7 @@ def find_lights(
             directions,
             max(expected_deg, differ_by_deg(directions, guess)),
             guess,
+            bump,
         )
     # If the lights have larger errors, the network that estimates normals also predicts larger
     # errors than the usual 2 degrees. The exponent was fitted on 150 other captures.
@@ -201,6 +202,7 @@ def _fit(
     mask: Bools,
     guess: Lights,
     errors_deg: Float64Array,
+    bump: float,
     intensities_known: bool,
     *,
     refuse: bool,
@@ -229,7 +231,9 @@ def _fit(
         directions, intensities = fit.directions, intensities * fit.intensities
         observations = np.asarray(observations / fit.intensities, np.float32)
     expected_deg = float(errors_deg.mean())
-    directions, _ = _bump_or_hollow(observations, mask, directions, expected_deg, guess.directions)
+    directions, _ = _bump_or_hollow(
+        observations, mask, directions, expected_deg, guess.directions, bump
+    )
     turn = turn_at_outline(observations, mask, directions)
     if turn is not None and turn.spread < 0.2:  # outlines of larger spread are ignored
         # Apply a share of the rotation. If it exceeds twice the expected error, the excess is due
@@ -246,12 +250,13 @@ def _bump_or_hollow(
     directions: Float64Array,
     expected_deg: float,
     guess: Float64Array,
+    bump: float,
 ) -> tuple[Float64Array, float]:
     """Return the directions (F, 3) or the opposite ones, whichever is more likely, and the risk of
     error.
 
-    Shadows, the outline and the network's guess decide. Opposite directions have x and y negated.
-    The risk is the probability that the other directions are right.
+    Shadows, the outline, and the network's guess and logit of a bump decide. Opposite directions
+    have x and y negated. The risk is the probability that the other directions are right.
     """
     away, opposite = (
         angle_between_deg(directions * sign, guess).mean() for sign in (1.0, OPPOSITE)
@@ -261,8 +266,10 @@ def _bump_or_hollow(
     log_odds = bump_log_odds(observations, mask, directions)
     # If the outline is visible, the network seldom confuses bumps with hollows: never on 113
     # rendered captures with expected errors below 14 degrees, but on three of nine above 20.
-    # Without an outline, its guess is random.
-    network = max(0.7, 7.0 - 0.25 * expected_deg) if is_outlined(mask) else 0.0
+    # Without an outline, its logit of a bump states how sure it is, but does not decide alone,
+    # because both may look the same. On 224 rendered captures, it reduced the share of wrong
+    # decisions from 12 to 5 %.
+    network = max(0.7, 7.0 - 0.25 * expected_deg) if is_outlined(mask) else min(abs(bump), 1.0)
     sign = -1.0 if log_odds + network < 0 else 1.0
     directions = directions * OPPOSITE if sign < 0 else directions
     # A hollow is only certain with other evidence, because the network mistook a ball of an
@@ -334,9 +341,9 @@ def _check_different(observations: Float32Array) -> None:
 
 def _ask_network(
     observations: Float32Array, mask: Bools
-) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return the network's directions (F, 3), their expected errors (F,) in degrees and intensities
-    (F,).
+) -> tuple[Float64Array, Float64Array, Float64Array, float]:
+    """Return the network's directions (F, 3), their expected errors (F,) in degrees, intensities
+    (F,), and the logit that the object is a bump.
 
     They are averaged over the four rotations of the images by 90 degrees and their mirror images.
     """
@@ -356,7 +363,7 @@ def _ask_network(
     network = light_net()
     # Each view runs in one thread, so that the number of threads does not affect rounding.
     guesses = [*side_by_side(lambda view: _view(network, images, inside, *view), _VIEWS)]
-    directions, sharpness, log_intensities, _ = (
+    directions, sharpness, log_intensities, bump = (
         torch.cat(part).double() for part in zip(*guesses, strict=True)
     )
     towards = (sharpness.exp()[..., None] * directions).sum(dim=0)
@@ -367,6 +374,7 @@ def _ask_network(
         mean.numpy(),
         (own + between).sqrt().rad2deg().numpy(),
         log_intensities.mean(dim=0).exp().numpy(),
+        float(bump.mean()),
     )
 
 
