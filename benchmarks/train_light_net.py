@@ -1,7 +1,7 @@
 """Render small scenes for the light network, and train it on them and on other pixel sets.
 
     python benchmarks/train_light_net.py draw SET SHAPES RELIEF [--scenes 300] [--seed 0]
-    python benchmarks/train_light_net.py train SET... --steps 60000 -o light-net.safetensors
+    python benchmarks/train_light_net.py train SET... [--steps 60000] [--start-from NET] [-o NET]
 
 SHAPES and RELIEF are the folders of examples/render_training_scenes.sh. Both continue after an
 interruption. A scene takes about three seconds on one core.
@@ -54,13 +54,16 @@ Scenes = Sequence[tuple[PixelSet, Entry]]
 
 
 def draw(output: Path, meshes: Path, reliefs: Path, scenes: int, seed: int) -> None:
-    """Render the scenes that a set does not have, in one set of materials of each class.
+    """Render the scenes that a set does not have, each in a set of materials of each class.
 
-    40 % are groups of bodies, 15 % views of the meshes, 20 % random shapes, and 25 % smooth.
+    40 % are groups of bodies, 15 % views of the meshes, 20 % random shapes, and 25 % smooth shapes
+    (see draw_smooth).
     """
     files = [path for path in sorted(meshes.glob("*.ply")) if path.stem not in KEPT_BACK]
     maps = sorted(reliefs.glob("*.jpg"))
-    writer = PixelSetWriter(output)
+    if not files or not maps:
+        raise SystemExit(f"expected meshes (.ply) in {meshes} and normal maps (.jpg) in {reliefs}")
+    writer, recipe = PixelSetWriter(output), asdict(RENDERING) | {"seed": seed}
     for index in range(scenes):
         name = f"scene{index:04}"
         if f"{name}-{KINDS[-1]}" in writer:
@@ -83,7 +86,7 @@ def draw(output: Path, meshes: Path, reliefs: Path, scenes: int, seed: int) -> N
         for kind, observations in rendered.observations.items():
             parts = observations.astype(np.float16), rendered.normals, scene.lights, rendered.mask
             source = f"rendered: {scene.shape if mesh is None else shape}"
-            writer.add(f"{name}-{kind}", name, source, asdict(RENDERING), Pixels(*parts))
+            writer.add(f"{name}-{kind}", name, source, recipe, Pixels(*parts))
         print(name, source, flush=True)
     writer.finish()
 

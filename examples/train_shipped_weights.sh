@@ -5,8 +5,8 @@
 #
 # SHAPES is a folder with the meshes of CREDITS.md (.ply), RELIEF one with its tileable normal maps (.jpg). Needs the
 # extra 'render' (pip install -c constraints.txt '.[render]') and a clone with its history, because the runs start from
-# earlier weights. They take an estimated ten hours on two cores. With 'scratch', it first trains replacements of the
-# earlier weights, and cnn-ps, in an estimated seventeen hours more. If it is interrupted, the same command continues.
+# earlier weights. They take an estimated eleven hours on two cores. With 'scratch', it first trains replacements of
+# the earlier weights, and cnn-ps, in an estimated twenty hours more. If it is interrupted, the same command continues.
 # See MODEL_CARD.md.
 set -eu
 folder=${1:?name a folder for the scenes and the runs}

@@ -8,6 +8,7 @@ import time
 from importlib.resources import files
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -280,6 +281,10 @@ def test_train_light_net(run, tmp_path, monkeypatch, rng):
     tiny = SceneConfig(size=16, lights=8, samples=1, directions=4, bounces=1)
     monkeypatch.setattr("train_light_net.RENDERING", tiny)
     (tmp_path / "relief").mkdir()
+    with pytest.raises(SystemExit, match="expected meshes"):
+        run(f"train_light_net draw {tmp_path}/drawn {tmp_path} {tmp_path}/relief")
+    flat = np.full((16, 16, 3), (255, 128, 128), np.uint8)
+    cv2.imwrite(str(tmp_path / "relief" / "flat.jpg"), flat)
     trimesh.creation.icosphere(3).export(tmp_path / "mesh.ply")
     command = f"train_light_net draw {tmp_path}/drawn {tmp_path} {tmp_path}/relief --seed 4"
     kinds = [line.split()[-1] for line in run(f"{command} --scenes 4").splitlines()]

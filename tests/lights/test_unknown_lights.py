@@ -258,6 +258,14 @@ def test_the_outline_tells_a_bump_from_a_hollow():
     assert bump_log_odds(images, inside, lights * OPPOSITE) < -5
 
 
+@parametrize(("bump", "risk"), [(0.0, 0.5), (-0.5, 0.378), (9.0, 0.269)])
+def test_without_outline_the_network_alone_is_not_certain(bump, risk):
+    everywhere, true = np.ones((SIZE, SIZE), np.bool_), lights()
+    images = np.float32(shade(sphere_cap(SIZE).reshape(-1, 3), true, noise=0.002))
+    found = unknown_lights._bump_or_hollow(images, everywhere, true, 5.0, true, bump)
+    assert found == (approx(true), approx(risk, abs=0.001))
+
+
 @parametrize("hollow", [False, True])
 def test_a_wrong_guess_of_the_network_is_turned_around(hollow, monkeypatch):
     lights, mask = ring_lights(10, 60), np.ones((64, 64), np.bool_)

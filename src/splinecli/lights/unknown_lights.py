@@ -13,8 +13,8 @@ The lights are estimated in three steps. The light network guesses each light fr
 and outline, and predicts the error of its guess. Since a matte surface under F lights has images of
 rank 3 (Hayakawa, JOSA A 1994) and its normals have no curl, least_curl.py finds further candidates.
 Starting from these and from lights near the guess, estimate/light_descent.py searches for lights
-under which the network that estimates normals predicts the smallest errors. Cast shadows and the
-outline decide between bump and hollow.
+under which the network that estimates normals predicts the smallest errors. Cast shadows, the
+outline and the light network decide between bump and hollow.
 """
 
 import math
@@ -123,9 +123,10 @@ def find_lights(
     The observations (P, F) are linear, non-negative, and divided by the light intensities if these
     are known; otherwise, the intensities are estimated as well. The mask (H, W) has P true pixels,
     in row-major order. `first_light` is the side that the light of the first observations comes
-    from (see azimuth_of), which decides between a bump and a hollow. Without it, cast shadows and
-    the outline decide. `first_image` is the name of the first image in messages. If the images do
-    not determine the lights, an error is raised; without `refuse`, a guess is returned instead.
+    from (see azimuth_of), which decides between a bump and a hollow. Without it, cast shadows, the
+    outline and the light network decide. `first_image` is the name of the first image in messages.
+    If the images do not determine the lights, an error is raised; without `refuse`, a guess is
+    returned instead.
 
     Raises UsageError if the first light is neither a known side nor an azimuth; InputError if the
     images are all alike, do not show one surface, or do not determine the lights.
@@ -266,8 +267,8 @@ def _bump_or_hollow(
     log_odds = bump_log_odds(observations, mask, directions)
     # If the outline is visible, the network seldom confuses bumps with hollows: never on 113
     # rendered captures with expected errors below 14 degrees, but on three of nine above 20.
-    # Without an outline, its logit of a bump states how sure it is, but does not decide alone,
-    # because both may look the same. On 224 rendered captures, it reduced the share of wrong
+    # Without an outline, its logit of a bump states how sure it is of either, but does not decide
+    # alone, because both may look the same. On 224 rendered captures, it reduced the share of wrong
     # decisions from 12 to 5 %.
     network = max(0.7, 7.0 - 0.25 * expected_deg) if is_outlined(mask) else min(abs(bump), 1.0)
     sign = -1.0 if log_odds + network < 0 else 1.0
