@@ -44,7 +44,7 @@ from splinecli.workshop.training.tasks import open_sets
 
 HELD_SHARE = 0.04
 IMAGES_PER_STEP, MOST_CAPTURES = 96, 16
-RATE = 2e-3
+RATE = 1e-3
 RENDERING = SceneConfig(
     size=72, lights=64, samples=2, directions=16, bounces=2, perspective_share=0.2
 )
@@ -276,9 +276,7 @@ def train(sets: Sequence[Path], steps: int, output: Path, start_from: Path | Non
     )
     torch.manual_seed(0)
     network, average = LightNet().to(memory_format=torch.channels_last), LightNet()
-    peak = RATE
     if start_from is not None:
-        peak = RATE / 2
         widen(network, load_file(start_from))
     optimiser = torch.optim.AdamW(
         network.parameters(), RATE, betas=(0.9, 0.99), weight_decay=1e-3, fused=True
@@ -293,7 +291,7 @@ def train(sets: Sequence[Path], steps: int, output: Path, start_from: Path | Non
     captures = Captures(training, 0, step)
     batches = iter(DataLoader(captures, batch_size=None, num_workers=1, prefetch_factor=6))
     while step < steps:
-        rate = peak * min(1, (step + 1) / 100) * (1 + math.cos(math.pi * step / steps)) / 2 + 1e-6
+        rate = RATE * min(1, (step + 1) / 100) * (1 + math.cos(math.pi * step / steps)) / 2 + 1e-6
         for group in optimiser.param_groups:
             group["lr"] = rate
         likelihood, angle, intensity, side = losses(network, *next(batches))
