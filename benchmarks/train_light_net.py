@@ -83,9 +83,9 @@ def draw(output: Path, meshes: Path, reliefs: Path, scenes: int, seed: int) -> N
         rendered = render_scene(scene, RENDERING)
         if not rendered.mask.any():
             continue
+        source = f"rendered: {scene.shape if mesh is None else shape}"
         for kind, observations in rendered.observations.items():
             parts = observations.astype(np.float16), rendered.normals, scene.lights, rendered.mask
-            source = f"rendered: {scene.shape if mesh is None else shape}"
             writer.add(f"{name}-{kind}", name, source, recipe, Pixels(*parts))
         print(name, source, flush=True)
     writer.finish()

@@ -44,6 +44,7 @@ earlier() {
   mv "$2.part" "$2"
 }
 combine() { "$python" "$here/../benchmarks/combine_weights.py" "$@"; }
+light_net() { "$python" "$here/../benchmarks/train_light_net.py" "$@"; }
 # Render sets of scenes, and list their folders in `sets`.
 render() {
   sh "$here/render_training_scenes.sh" "$folder" "$shapes" "$relief" "$@"
@@ -97,7 +98,7 @@ echo "$folder/weights.safetensors"
 
 # The light network, which learns from small scenes, too.
 for n in 0 1 2; do
-  "$python" "$here/../benchmarks/train_light_net.py" draw "$folder/light-$n" "$shapes" "$relief" --seed $((7500 + n))
+  light_net draw "$folder/light-$n" "$shapes" "$relief" --seed $((7500 + n))
   sets="$sets $folder/light-$n"
 done
 set -- --steps 60000
@@ -105,7 +106,7 @@ if [ -z "$of" ]; then
   earlier light-net "$folder/light-start.safetensors"
   set -- --steps 12000 --start-from "$folder/light-start.safetensors"
 fi
-"$python" "$here/../benchmarks/train_light_net.py" train $sets "$@" -o "$folder/light-net$of.safetensors"
+light_net train $sets "$@" -o "$folder/light-net$of.safetensors"
 echo "$folder/light-net$of.safetensors"
 
 # The material net reads the tokens of the spline-net in the package, so put the new weights there first.
