@@ -36,12 +36,12 @@ run() {
   "$python" -m torch.distributed.run --nproc-per-node "$processes" -m splinecli train "$@" -o "$folder/$name"
   touch "$folder/$name/finished"
 }
-# Write weights as they were after run 27 of docs/training-history.md.
+# Write the weights of a network as a commit has them.
 earlier() {
-  if [ -e "$2" ]; then return; fi
-  git -C "$here" show "e1a8d46809746c318b7a58fe676dc158ade36d09:src/splinecli/assets/$1.safetensors" > "$2.part" ||
+  if [ -e "$3" ]; then return; fi
+  git -C "$here" show "$1:src/splinecli/assets/$2.safetensors" > "$3.part" ||
     fail "needs a clone with its history: git fetch --unshallow"
-  mv "$2.part" "$2"
+  mv "$3.part" "$3"
 }
 combine() { "$python" "$here/../benchmarks/combine_weights.py" "$@"; }
 light_net() { "$python" "$here/../benchmarks/train_light_net.py" "$@"; }
@@ -72,7 +72,7 @@ if [ "${4:-}" = scratch ]; then
     --start-from "$folder/cnn-ps-1/weights.safetensors"
   cp "$folder/spline-net-4/weights.safetensors" "$start"
 else
-  earlier spline-net "$start"
+  earlier e1a8d46809746c318b7a58fe676dc158ade36d09 spline-net "$start" # after run 27 of docs/training-history.md
 fi
 
 # The pixelwise networks, then their error head. `sets` is split at spaces.
@@ -96,17 +96,20 @@ run "refined$of" $sets --preset refine --steps 3200 --seed 31 --param learning_r
 combine mean "$joined" "$folder/refined$of/weights.safetensors" "$folder/weights.safetensors"
 echo "$folder/weights.safetensors"
 
-# The light network, which learns from small scenes, too.
-for n in 0 1 2; do
+# The light network, which learns from small scenes.
+scenes='3 4 5 6 7 8'
+if [ -n "$of" ]; then scenes="0 1 2 $scenes"; fi
+small=
+for n in $scenes; do
   light_net draw "$folder/light-$n" "$shapes" "$relief" --seed $((7500 + n))
-  sets="$sets $folder/light-$n"
+  small="$small $folder/light-$n"
 done
 set -- --steps 60000
 if [ -z "$of" ]; then
-  earlier light-net "$folder/light-start.safetensors"
-  set -- --steps 12000 --start-from "$folder/light-start.safetensors"
+  earlier 4d062e5338304a2469b441e3850f566a9d1857ba light-net "$folder/light-start.safetensors" # after its run 2
+  set -- --steps 24000 --start-from "$folder/light-start.safetensors"
 fi
-light_net train $sets "$@" -o "$folder/light-net$of.safetensors"
+light_net train $small "$@" -o "$folder/light-net$of.safetensors"
 echo "$folder/light-net$of.safetensors"
 
 # The material net reads the tokens of the spline-net in the package, so put the new weights there first.

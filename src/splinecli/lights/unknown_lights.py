@@ -146,7 +146,7 @@ def find_lights(
         others = (differ_by_deg(each.directions, start.directions) for start in starts)
         if len(starts) < _MOST_STARTS and min(others) > _OTHER_DEG:
             starts.append(each)
-    found_deg = _usual_error_deg(expected_deg, outlined=is_outlined(mask))
+    found_deg = _usual_error_deg(expected_deg)
     found = search(
         observations,
         mask,
@@ -189,13 +189,13 @@ def find_lights(
     )
 
 
-def _usual_error_deg(expected_deg: float, *, outlined: bool) -> float:
+def _usual_error_deg(expected_deg: float) -> float:
     """Return the mean error of fitted lights, from the error predicted by the network.
 
-    It was fitted on 720 rendered captures, because the network predicts too large errors for easy
+    It was fitted on 170 rendered captures, because the network predicts too large errors for easy
     objects. The 1.2 degrees are for photographs.
     """
-    return math.hypot(0.39 * expected_deg**1.3 if outlined else 0.65 * expected_deg, 1.2)
+    return math.hypot(0.28 * expected_deg**1.3, 1.2)
 
 
 def _fit(
