@@ -5,7 +5,7 @@
 #
 # SHAPES is a folder with the meshes of CREDITS.md (.ply), RELIEF one with its tileable normal maps (.jpg). Needs the
 # extra 'render' (pip install -c constraints.txt '.[render]') and a clone with its history, because the runs start from
-# earlier weights. They take an estimated eleven hours on two cores. With 'scratch', it first trains replacements of
+# earlier weights. They take an estimated twelve hours on two cores. With 'scratch', it first trains replacements of
 # the earlier weights, and cnn-ps, in an estimated twenty hours more. If it is interrupted, the same command continues.
 # See MODEL_CARD.md.
 set -eu
@@ -36,7 +36,7 @@ run() {
   "$python" -m torch.distributed.run --nproc-per-node "$processes" -m splinecli train "$@" -o "$folder/$name"
   touch "$folder/$name/finished"
 }
-# Write the weights of a network as a commit has them.
+# Write the weights of a network in an earlier commit: earlier COMMIT NETWORK FILE
 earlier() {
   if [ -e "$3" ]; then return; fi
   git -C "$here" show "$1:src/splinecli/assets/$2.safetensors" > "$3.part" ||
@@ -93,24 +93,24 @@ run "refined$of" $sets --preset refine --steps 3200 --seed 31 --param learning_r
   --param first_captures=200 --param shards=2 --start-from "$joined"
 
 # The mean of start and end is better on unseen scenes than either of them.
-combine mean "$joined" "$folder/refined$of/weights.safetensors" "$folder/weights.safetensors"
-echo "$folder/weights.safetensors"
+combine mean "$joined" "$folder/refined$of/weights.safetensors" "$folder/weights$of.safetensors"
+echo "$folder/weights$of.safetensors"
 
 # The light network, which learns from small scenes.
-scenes='3 4 5 6 7 8'
-if [ -n "$of" ]; then scenes="0 1 2 $scenes"; fi
+numbers='3 4 5 6 7 8'
+if [ -n "$of" ]; then numbers="0 1 2 $numbers"; fi
 small=
-for n in $scenes; do
+for n in $numbers; do
   light_net draw "$folder/light-$n" "$shapes" "$relief" --seed $((7500 + n))
   small="$small $folder/light-$n"
 done
 set -- --steps 60000
 if [ -z "$of" ]; then
-  earlier 4d062e5338304a2469b441e3850f566a9d1857ba light-net "$folder/light-start.safetensors" # after its run 2
-  set -- --steps 24000 --start-from "$folder/light-start.safetensors"
+  earlier 4d062e5338304a2469b441e3850f566a9d1857ba light-net "$folder/light-start-3.safetensors" # after its run 2
+  set -- --steps 24000 --start-from "$folder/light-start-3.safetensors"
 fi
-light_net train $small "$@" -o "$folder/light-net$of.safetensors"
-echo "$folder/light-net$of.safetensors"
+light_net train $small "$@" -o "$folder/light-net-3$of.safetensors"
+echo "$folder/light-net-3$of.safetensors"
 
 # The material net reads the tokens of the spline-net in the package, so put the new weights there first.
 #   python benchmarks/train_material_net.py draw "$folder/material"
