@@ -192,11 +192,11 @@ def photograph(
         x, y = -y, x
     if uniform() < 0.5:
         images, inside, x = images.flip(2), inside.flip(1), -x
+    directions = torch.stack((x, y, z), dim=1)
     sigma = 0.0 if uniform() < 0.4 else uniform(0, 0.8) * math.log(2)
     intensities = sigma * torch.randn(count, generator=generator)
     if sigma > 0 and uniform() < 0.4:  # the object is not in the middle of the lamps
-        across = 0.3 * torch.randn(2, generator=generator)
-        intensities = intensities + across[0] * x + across[1] * y
+        intensities += 0.3 * directions[:, :2] @ torch.randn(2, generator=generator)
     images = images * intensities.exp()[:, None, None]
     values = images[:, inside > 0].flatten()
     rank = math.ceil((1 - 10 ** uniform(-3.5, -1.5)) * len(values))
@@ -210,7 +210,6 @@ def photograph(
         images = images + uniform(0, 0.03) * images[:, inside > 0].mean() * inside
     if uniform() < 0.1:  # an unknown curve
         images = images ** uniform(0.8, 1.2)
-    directions = torch.stack((x, y, z), dim=1)
     return [
         (network_inputs(images, inside).half(), directions, intensities - intensities.mean(), bump)
     ]

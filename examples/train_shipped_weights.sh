@@ -97,18 +97,19 @@ combine mean "$joined" "$folder/refined$of/weights.safetensors" "$folder/weights
 echo "$folder/weights$of.safetensors"
 
 # The light network, which learns from small scenes.
-numbers='3 4 5 6 7 8'
-if [ -n "$of" ]; then numbers="0 1 2 $numbers"; fi
+if [ -n "$of" ]; then
+  numbers='0 1 2 3 4 5 6 7 8'
+  set -- --steps 60000
+else
+  numbers='3 4 5 6 7 8'
+  earlier 4d062e5338304a2469b441e3850f566a9d1857ba light-net "$folder/light-start-3.safetensors" # after its run 2
+  set -- --steps 24000 --start-from "$folder/light-start-3.safetensors"
+fi
 small=
 for n in $numbers; do
   light_net draw "$folder/light-$n" "$shapes" "$relief" --seed $((7500 + n))
   small="$small $folder/light-$n"
 done
-set -- --steps 60000
-if [ -z "$of" ]; then
-  earlier 4d062e5338304a2469b441e3850f566a9d1857ba light-net "$folder/light-start-3.safetensors" # after its run 2
-  set -- --steps 24000 --start-from "$folder/light-start-3.safetensors"
-fi
 light_net train $small "$@" -o "$folder/light-net-3$of.safetensors"
 echo "$folder/light-net-3$of.safetensors"
 
