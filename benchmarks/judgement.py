@@ -30,6 +30,7 @@ from splinecli.pipeline.infer_options import InferOptions
 from splinecli.records.capture_warnings import PROBABLY_WRONG
 
 NO_CAUSE = {"low_confidence", "unknown_material"}  # warnings that accuse no input
+DOUBTS = {"reading_undecided", "lights_uncertain"}  # warnings that name no cause as the right one
 GAP, WORSE_DEG, HARMLESS_DEG = 25, 0.5, 0.2
 """An estimate is silently wrong if its expected share exceeds the true one by so many points."""
 UNDO = {
@@ -174,6 +175,7 @@ class Measured:
         right_codes = FAULTS.get(self.kind, ((), ()))[1]
         self.named = not self.codes.isdisjoint(right_codes)
         self.silent = bool(self.gap > GAP) and not self.named
+        self.sure = self.silent and self.codes.isdisjoint(DOUBTS)
         self.misnamed = bool(self.errors - NO_CAUSE) and not self.named
 
 
@@ -217,7 +219,8 @@ def right_table(captures: Sequence[Measured], key: str) -> Table:
 
 def faulty_table(captures: Sequence[Measured], *, degrees: bool) -> Table:
     """Return what becomes of faulty captures, by the kind of their fault."""
-    header = ["n", "named", "silent, wrong", "misnamed", "mended", "MAE as given", "MAE", "worse"]
+    header = ["n", "named", "silent, wrong", "without a doubt", "misnamed", "mended"]
+    header += ["MAE as given", "MAE", "worse"]
     table = {"fault": header}
     groups = grouped(
         captures,
@@ -228,6 +231,7 @@ def faulty_table(captures: Sequence[Measured], *, degrees: bool) -> Table:
             str(len(group)),
             share(group, lambda each: each.named),
             share(group, lambda each: each.silent),
+            share(group, lambda each: each.sure),
             share(group, lambda each: each.misnamed),
             share(group, lambda each: each.mended),
             mean(each.mae_given for each in group),
