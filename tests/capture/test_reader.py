@@ -124,7 +124,7 @@ def test_warnings(capture_folder, write_image):
         write_image(f"vase/img{number}.png", pixels)
     assert texts(read_capture(capture_folder).warnings) == (
         "5.0 % of the observations are saturated. A shorter exposure gives better normals.",
-        "The images have 8 bits, which costs less than 0.5 degrees.",
+        "The images have 8 bits, which costs less than 1 degree.",
     )
     for n_black, share in ((1, None), (2, "2.0"), (100, "100.0")):
         for number in range(8, 12):

@@ -234,9 +234,9 @@ def test_dark_values_of_sixteen_bits_are_dark(run):
 @parametrize(
     ("share", "words", "is_dark"),
     [
-        (0.9, "The images have 8 bits, which costs less than 0.5 degrees.", False),
-        (0.4, "The images have 8 bits and use 40 % of the range, which costs up to 0.8", False),
-        (0.2, "The images have 8 bits and use 20 % of the range, which costs up to 1.6", True),
+        (0.9, "The images have 8 bits, which costs less than 1 degree.", False),
+        (0.4, "The images have 8 bits and use 40 % of the range, which costs up to 1.2", False),
+        (0.2, "The images have 8 bits and use 20 % of the range, which costs up to 2.5", True),
         (
             0.1,
             "10 of 10 images use less than 25 % of the range, such as 000.png. A longer exposure",
