@@ -30,7 +30,7 @@ from splinecli.pipeline.infer_options import InferOptions
 from splinecli.records.capture_warnings import PROBABLY_WRONG
 
 NO_CAUSE = {"low_confidence", "unknown_material"}  # warnings that accuse no input
-DOUBTS = {"reading_undecided", "lights_uncertain"}  # warnings that name no cause as the right one
+DOUBTS = {"reading_undecided", "lights_uncertain"}  # warnings that state a doubt, but no cause
 GAP, WORSE_DEG, HARMLESS_DEG = 25, 0.5, 0.2
 """An estimate is silently wrong if its expected share exceeds the true one by so many points."""
 UNDO = {
@@ -219,7 +219,7 @@ def right_table(captures: Sequence[Measured], key: str) -> Table:
 
 def faulty_table(captures: Sequence[Measured], *, degrees: bool) -> Table:
     """Return what becomes of faulty captures, by the kind of their fault."""
-    header = ["n", "named", "silent, wrong", "without a doubt", "misnamed", "mended"]
+    header = ["n", "named", "silent, wrong", "without a stated doubt", "misnamed", "mended"]
     header += ["MAE as given", "MAE", "worse"]
     table = {"fault": header}
     groups = grouped(

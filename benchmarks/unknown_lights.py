@@ -79,9 +79,9 @@ def report(rows: dict[str, list[Row]]) -> None:
         print(f"| {shape} | {' | '.join(cells)} |")
     ratio = np.abs(np.log(errors[kept] / expected[kept]))
     shares = ", ".join(f"{np.mean(ratio < np.log(most)):.0%} of {most}" for most in (1.6, 2, 3))
-    factor = (errors[kept] / expected[kept]).mean()  # of the largest exponential likelihood
+    factor = (errors[kept] / expected[kept]).mean()  # most likely one if errors are exponential
     print(
-        f"mean expected error {expected[kept].mean():.1f}, would fit best times {factor:.2f};"
+        f"mean expected error {expected[kept].mean():.1f} (best fit: times {factor:.2f});"
         f" within a factor: {shares}"
     )
 
