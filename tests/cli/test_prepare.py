@@ -26,7 +26,7 @@ def arrays(entry):
 
 
 def test_a_capture(run, capture, truth):
-    out = "set: 1 entries of 1 scenes, 448 pixels, 0 MB; overview in set/contact_sheet.png\n"
+    out = "set: 1 entry of 1 scene, 448 pixels, 0 MB; overview in set/contact_sheet.png\n"
     run(f"prepare {capture} -o set", out=out, err="sphere: 448 pixels, 8 lights, sphere\n")
     found = arrays("sphere")
     mask = found["mask"]
@@ -63,7 +63,7 @@ def test_the_same_command_continues(run, make_capture):
     shutil.move(two / "image3.png", "hidden.png")
     result = run(f"prepare {one} {two} -o set", input_error="two")
     # The good capture is in the set, and the bad one is named.
-    assert result.out.startswith("set: 1 entries of 1 scenes, 448 pixels")
+    assert result.out.startswith("set: 1 entry of 1 scene, 448 pixels")
     before = Path("set/one/observations.npy").stat()
     shutil.move("hidden.png", two / "image3.png")
     assert run(f"prepare {one} {two} -o set").out.startswith("set: 2 entries of 2 scenes")

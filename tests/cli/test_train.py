@@ -55,7 +55,7 @@ def write_set(folder, *, finished=True):
 
 def test_a_run_and_its_continuation(run, monkeypatch):
     result = run(
-        "train -o run --steps 3", says="step 3, 48 pixels", out="run/weights.safetensors\n"
+        "train -o run --steps 3", says="step 3, 0.0 minutes: loss", out="run/weights.safetensors\n"
     )
     assert names_in("run") == SAVED | {"curves.png", "maps.png"}
     assert settings()["steps"] == 3

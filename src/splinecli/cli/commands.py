@@ -142,10 +142,11 @@ def prepare(options: PrepareOptions) -> int:
     from splinecli.workshop.prepare import prepare_pixel_set
 
     summary = prepare_pixel_set(options, Messages(quiet=options.quiet))
+    entries = "1 entry" if summary["entries"] == 1 else f"{summary['entries']} entries"
+    scenes = "1 scene" if summary["scenes"] == 1 else f"{summary['scenes']} scenes"
     in_words = (
-        f"{summary['set']}: {summary['entries']} entries of {summary['scenes']} scenes,"
-        f" {summary['n_pixels']} pixels, {summary['bytes'] / 1e6:.0f} MB; overview in"
-        f" {summary['contact_sheet']}"
+        f"{summary['set']}: {entries} of {scenes}, {summary['n_pixels']} pixels,"
+        f" {summary['bytes'] / 1e6:.0f} MB; overview in {summary['contact_sheet']}"
     )
     print_report(
         summary,
@@ -240,7 +241,7 @@ def _run(trainer: Trainer, messages: Messages) -> None:
             shown = progress
             # A terminal shows a progress bar. Elsewhere, print a line for each checkpoint.
             if metrics.validation_deg is not None and (progress >= 1 or not sys.stderr.isatty()):
-                messages.say(f"step {metrics.step}, {metrics.pixels} pixels, {_losses(metrics)}")
+                messages.say(f"step {metrics.step}, {_losses(metrics)}")
 
         trainer.run(report)
 
