@@ -38,6 +38,7 @@ Rows = dict[str, Callable[[], Cells]]
 # do not depend on the weights of spline-net
 WITHOUT_WEIGHTS = ("calibration", "wrong-lights", "cnn-ps")
 NEED_QUIET = ("speed", "sizes")
+ONE_DRAW = {"trials": 1, "seed": 3, "n_lights": (10,), "max_pixels": None}
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,10 @@ class Bench:
     @property
     def synth(self) -> dict[str, Path]:
         return {name: self.data / "synth/L17" / name.replace(" ", "_") for name in SYNTH}
+
+    @property
+    def statues(self) -> dict[str, Path]:
+        return {name: self.data / "statues" / name for name in tables.STATUES}
 
     def errors(
         self, folder: str, captures: Mapping[str, Path], method: str, **options: Any
@@ -122,24 +127,39 @@ class Bench:
             cells |= {f"{r['label']} {word}": r["mae_deg"] for r in found}
         return cells
 
+    def range_of_8_bits(self, convert: Callable[[Any], Any]) -> Cells:
+        """Return the largest increase of an error if the brightest hundredth of the pixels is at
+        shares of the range of 8 bits, on all pixels under one draw of ten lights.
+        """
+        captures = {**self.objects, **self.synth, **self.statues}
+        given = {
+            r["label"]: r["mae_deg"]
+            for r in self.errors("given", captures, "spline-net", **ONE_DRAW)
+        }
+        cells: Cells = {}
+        for share in tables.RANGES:
+            name = f"{convert.__name__} at {share}"
+            copies = {}
+            for label, path in captures.items():
+                factor = share / brightness(path)
+                copies[label] = rewritten(
+                    path, self.results / name, lambda image, factor=factor: convert(factor * image)
+                )
+            found = self.errors(f"{name} errors", copies, "spline-net", **ONE_DRAW)
+            cells[f"{share} %"] = round(max(r["mae_deg"] - given[r["label"]] for r in found), 4)
+        return cells
+
     def optics(self, convert: Callable[[Any], Any], name: str) -> Cells:
         """Score the statues after a camera, on all pixels under one draw of ten lights, restored as
         `infer` does.
         """
-        captures = {label: self.data / "statues" / label for label in tables.STATUES}
         copies = {
-            label: rewritten(path, self.results / name, convert) for label, path in captures.items()
+            label: rewritten(path, self.results / name, convert)
+            for label, path in self.statues.items()
         }
         cells: Cells = {}
         for method, word in zip(NETWORKS, ("pixelwise", "refined"), strict=True):
-            options = {
-                "trials": 1,
-                "seed": 3,
-                "n_lights": (10,),
-                "max_pixels": None,
-                "as_stored": False,
-            }
-            found = self.errors(f"{name} errors", copies, method, **options)
+            found = self.errors(f"{name} errors", copies, method, **ONE_DRAW, as_stored=False)
             cells |= {f"{r['label']} {word}": r["mae_deg"] for r in found}
         return cells
 
@@ -337,10 +357,6 @@ class Bench:
     def measurements(self) -> dict[str, Rows]:
         """Return what measures each row of each measurement."""
         captures = (*OBJECTS, *SYNTH)
-        rounded, cut = (
-            lambda image: np.round(image / 257).astype("u1"),
-            lambda image: (image >> 8).astype("u1"),
-        )
         cameras = {"as rendered": lambda image: image, "Bayer pattern, interpolated": mosaic}
         cameras |= {f"blurred, sigma {sigma}": partial(blur, sigma) for sigma in (0.5, 0.7, 1.0)}
         bits = {"16 bits": lambda image: image, "rounded to 8 bits": rounded, "cut to 8 bits": cut}
@@ -357,6 +373,10 @@ class Bench:
             "noise": {m: partial(self.noise, m) for m in (*FITS, *NETWORKS)},
             "eight-bits": {
                 name: partial(self.eight_bits, convert, name) for name, convert in bits.items()
+            },
+            "eight-bits-range": {
+                "rounded to 8 bits": partial(self.range_of_8_bits, rounded),
+                "cut to 8 bits": partial(self.range_of_8_bits, cut),
             },
             "optics": {
                 name: partial(self.optics, camera, name) for name, camera in cameras.items()
@@ -392,6 +412,29 @@ def means(
     return {name: round(fmean(errors), 4) for name, errors in values.items()}
 
 
+def images_of(folder: Path) -> list[Path]:
+    named = folder / "filenames.txt"
+    names = named.read_text("utf-8").split() if named.exists() else None
+    return [folder / name for name in names] if names else list(folder.glob("0*.png"))
+
+
+def brightness(folder: Path) -> float:
+    """Return the 99th percentile of the object's brightest image, in percent of the range."""
+    import cv2
+
+    inside = cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE) > 0
+    images = (cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in images_of(folder))
+    return max(float(np.quantile(image[inside], 0.99)) for image in images) / 655.35
+
+
+def rounded(image: Any) -> Any:
+    return np.clip(np.round(image / 257), 0, 255).astype("u1")
+
+
+def cut(image: Any) -> Any:
+    return np.clip(image // 256, 0, 255).astype("u1")
+
+
 def rewritten(folder: Path, place: Path, convert: Callable[[Any], Any]) -> Path:
     """Return a copy of a capture in `place` with converted images."""
     import cv2
@@ -400,13 +443,7 @@ def rewritten(folder: Path, place: Path, convert: Callable[[Any], Any]) -> Path:
     if not copy.is_dir():
         draft = place / f"{folder.name}.part"
         shutil.copytree(folder, draft, dirs_exist_ok=True)
-        named = folder / "filenames.txt"
-        images = (
-            [folder / name for name in named.read_text("utf-8").split()]
-            if named.exists()
-            else folder.glob("0*.png")
-        )
-        for path in images:
+        for path in images_of(folder):
             cv2.imwrite(
                 str(draft / path.name), convert(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
             )

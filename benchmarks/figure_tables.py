@@ -38,6 +38,7 @@ CAMERAS = (
     *(f"blurred, sigma {sigma}" for sigma in (0.5, 0.7, 1.0)),
     "Bayer pattern, interpolated",
 )
+RANGES = (90, 50, 20, 10, 5)
 SLANTS = {"below 60 degrees": (0, 60), "60 to 75 degrees": (60, 75), "above 75 degrees": (75, 91)}
 SYNTH = [f"{shape} {material}" for shape in ("sphere", "relief", "bowl") for material in "SM"]
 PUBLISHED = "published"
@@ -219,6 +220,13 @@ TABLES: dict[str, Table | Headline] = {
             for label in OBJECTS
             for name in ("pixelwise", "refined")
         },
+    ),
+    "eight-bits-range": Table(
+        ("eight-bits-range",),
+        "images",
+        same(("rounded to 8 bits", "cut to 8 bits")),
+        same([f"{share} %" for share in RANGES]),
+        "{:.1f}",
     ),
     "optics": Table(
         ("optics",),

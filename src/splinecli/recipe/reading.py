@@ -23,8 +23,7 @@ from splinecli.records.capture_warnings import CaptureWarning
 # An image is dark if its 99th percentile is below this share of the white level.
 DARK = {"uint8": 0.25, "uint16": 0.05}
 # About the largest error from rounding to 8 bits, in degrees, times the share of the range that is
-# used. Measured with spline-net on ten rendered and real captures with ten lights: 0.3 degrees if
-# the whole range is used, 0.8 for half of it, 2.2 for 20 %, 4.0 for 10 %, 10.9 for 5 %.
+# used: eight-bits-range of benchmarks/all_figures.py, tabulated in docs/robustness.md.
 _COST_OF_8_BITS = 0.5
 MOSTLY_SATURATED = 0.2  # an image is named if a larger share of its pixels is saturated
 _ENOUGH = 1_000_000  # values for a quantile, so that its rank is accurate to 0.01 % of the pixels
