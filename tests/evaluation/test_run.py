@@ -10,7 +10,19 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx
 
-from scenes import evaluate, parametrize, put, read_image, refuses, write_image
+from scenes import (
+    evaluate,
+    parametrize,
+    put,
+    read_image,
+    refuses,
+    shade,
+    sphere,
+    spiral_lights,
+    to_uint16,
+    write_capture,
+    write_image,
+)
 from splinecli.errors import InputError, SplinecliError, UsageError
 from splinecli.estimate.methods import Estimator, make_estimator
 from splinecli.evaluation.protocol import Protocol
@@ -113,6 +125,23 @@ def test_light_noise_costs_least_squares_its_exactness(write_dome):
     assert errors[0].mae_deg < 0.02 < 0.2 < errors[1].mae_deg
     # The trials' noise is the same but for its size, and small errors grow in proportion.
     assert errors[2].mae_deg == approx(4 * errors[1].mae_deg, rel=0.1)
+
+
+@parametrize("shift", [0, 6])
+def test_a_shifted_ground_truth_under_lamps_of_unequal_brightness(tmp_path, shift):
+    """Lamps are darker the further they are from the camera axis, which no file says."""
+    (normals, mask), lights = sphere(48), spiral_lights(20, 50, 15)
+    images = 400 * np.exp(5 * lights[:, 2]) * shade(normals, lights) * mask[..., None]
+    folder = write_capture(
+        tmp_path / "ball",
+        to_uint16(np.moveaxis(images, 2, 0)),
+        lights,
+        mask=mask,
+        normals=np.roll(np.where(mask[..., None], normals, 0), shift, 1),
+    )
+    notes = [n for n in evaluate([folder], LS, Protocol()).notes if "ground truth is" in n]
+    assert len(notes) == (shift > 0)
+    assert all("once a shift of 6 pixels right is undone" in note for note in notes)
 
 
 def test_captures_that_cannot_be_scored_are_skipped(write_dome, tmp_path):

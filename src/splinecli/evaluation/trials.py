@@ -27,6 +27,7 @@ from splinecli.estimate.methods import Estimator
 from splinecli.evaluation.protocol import NOISE_STREAM, PIXELS_STREAM, Protocol
 from splinecli.judge.odd_images import check_ground_truth
 from splinecli.lights.draws import Draw
+from splinecli.lights.light_fit import divide_by_fitted, find_factors
 from splinecli.maths.normals import angle_between_deg, unit
 from splinecli.recipe.steps import begin, follow
 from splinecli.recipe.work import RecipeOptions, Work
@@ -309,7 +310,8 @@ class CaptureReading:
             trials = TrialSource(stored, pixels)
         else:
             trials = TrialSource(stored.choose_pixels(pixels))
-        notes = [_notes(capture, self.name, protocol) for protocol in self.protocols]
+        known = source.intensities_measured
+        notes = [_notes(capture, self.name, protocol, known) for protocol in self.protocols]
         return trials, notes
 
 
@@ -321,7 +323,9 @@ def open_to_score(folder: Path, protocol: Protocol) -> CaptureSource:
         raise as_splinecli_error(error, folder) from error
 
 
-def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
+def _notes(
+    capture: Capture, name: str, protocol: Protocol, intensities_measured: bool
+) -> tuple[str, ...]:
     """Return sentences about peculiarities of a capture and how they were treated."""
     notes = []
     skipped, damaged = protocol.skipped_lights(name), DAMAGED_IMAGES.get(name, 0)
@@ -339,6 +343,10 @@ def _notes(capture: Capture, name: str, protocol: Protocol) -> tuple[str, ...]:
     ]
     if capture.ground_truth is not None:
         sample = sample_observations(capture.observations, capture.mask)
+        if not intensities_measured:
+            factors = find_factors(sample.observations, intensities_known=False)
+            values = divide_by_fitted(sample.observations, capture.light_directions, factors)
+            sample = replace(sample, observations=values)
         wrong = check_ground_truth(sample, capture.light_directions, capture.ground_truth)
         notes += [f"{name}: {warning}" for warning in wrong]
         without = capture.n_pixels - int(

@@ -29,7 +29,7 @@ from splinecli.judge.explanations import (
 from splinecli.judge.judge_net import CLASSES, RIGHT, TRANSLUCENT, features_of, judge_net
 from splinecli.judge.light_check import LightCheck, check_lights
 from splinecli.judge.tilt import Tilt, find_tilt, fitted_map
-from splinecli.lights.light_fit import Factors, find_factors
+from splinecli.lights.light_fit import Factors, divide_by_fitted, find_factors
 from splinecli.lights.rough_normals import median_turn_deg
 from splinecli.maths import Bools, Float64Array, Floats
 from splinecli.maths.normals import unit
@@ -159,10 +159,8 @@ class Evidence:
 
         This keeps unequal lamps from looking like a fault of the directions or the values.
         """
-        intensities = (
-            1.0 if self.factors is None else self.factors.intensities(self.directions[None])[0]
-        )
-        return replace(self.sample, observations=self.observations / intensities)
+        values = divide_by_fitted(self.observations, self.directions, self.factors)
+        return replace(self.sample, observations=values)
 
     @cached_property
     def explanations(self) -> Explanations:

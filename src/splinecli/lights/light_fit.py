@@ -133,6 +133,17 @@ def find_factors(observations: Floats, *, intensities_known: bool = True) -> Fac
     return Factors(scale @ matrix, residuals, intensities_known)
 
 
+def divide_by_fitted(
+    observations: Floats, light_directions: Float64Array, factors: Factors | None
+) -> Floats:
+    """Return observations (P, F), divided by the intensities that fit lights (F, 3) best; without
+    factors, or if the intensities are known, as they are.
+    """
+    if factors is None or factors.intensities_known:
+        return observations
+    return np.asarray(observations / factors.intensities(light_directions[None])[0])
+
+
 def random_misfits(factors: Factors, light_directions: Float64Array) -> Float64Array:
     """Return the ascending residuals of the lights (F, 3) in 250 random orders."""
     given = np.tile(np.arange(len(light_directions)), (250, 1))
