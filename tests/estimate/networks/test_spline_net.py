@@ -54,6 +54,16 @@ def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(pixels)
     assert_close(normals[visible], expected[visible], atol=1e-6, rtol=0, check_dtype=False)
 
 
+def test_gradients_are_finite_where_a_fit_points_at_the_camera():
+    """Lights that are estimated from images follow these gradients."""
+    lights = torch.tensor([[3.0, 0, 4], [-3, 0, 4], [0, 3, 4], [0, -3, 4]]) / 5
+    observations = torch.ones(1, 4)
+    assert not fit_lambertian(observations, lights)[:, :2].any()
+    normals = SplineNet(NetworkConfig(**TINY))(observations, lights.requires_grad_()).normals
+    (gradient,) = torch.autograd.grad(normals[0, 0], lights)
+    assert gradient.isfinite().all() and gradient.any()
+
+
 @parametrize("settings", [{}, SET])
 @parametrize("degrees", [90.0, 33.0, -171.5])
 def test_compact_estimates_turn_with_the_lights(pixels, degrees, settings):

@@ -132,8 +132,8 @@ class SplineNet(nn.Module):
             scaled_normals = observed.new_tensor((0.0, 0.0, 1.0)).expand(len(observed), 3)
         x, y, z = scaled_normals.unbind(-1)
         # Move a fit that points away from the camera to the rim, which has the closest visible
-        # normal.
-        z = torch.maximum(z, 0.02 * torch.hypot(x, y))
+        # normal. Unlike hypot, this norm has a finite gradient at zero.
+        z = torch.maximum(z, 0.02 * scaled_normals[:, :2].norm(dim=-1))
         azimuth = torch.atan2(y, x) if self.config.is_canonical else torch.zeros_like(x)
         turn_deg = torch.as_tensor(rotation.turn_deg, device=azimuth.device)
         angle = turn_deg * (math.pi / 180) - azimuth
