@@ -251,13 +251,15 @@ def losses(
 
 
 def widen(network: LightNet, narrow: dict[str, Tensor]) -> None:
-    """Give a network the function of one with fewer features per layer (Chen et al., "Net2Net",
-    ICLR 2016).
+    """Give a network the function of one with fewer features per layer, or without some of its
+    residual layers (Chen et al., "Net2Net", ICLR 2016).
 
     Its own features do not change the features of the narrow one yet.
     """
     for name, values in network.state_dict().items():
-        known = narrow[name]
+        if (known := narrow.get(name)) is None:
+            values.zero_()
+            continue
         if values.ndim == 1:
             values[: len(known)] = known
             continue

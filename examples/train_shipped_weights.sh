@@ -5,7 +5,7 @@
 #
 # SHAPES is a folder with the meshes of CREDITS.md (.ply), RELIEF one with its tileable normal maps (.jpg). Needs the
 # extra 'render' (pip install -c constraints.txt '.[render]') and a clone with its history, because the runs start from
-# earlier weights. They take an estimated twelve hours on two cores. With 'scratch', it first trains replacements of
+# earlier weights. They take an estimated thirteen hours on two cores. With 'scratch', it first trains replacements of
 # the earlier weights, and cnn-ps, in an estimated twenty hours more. If it is interrupted, the same command continues.
 # See MODEL_CARD.md.
 set -eu
@@ -98,20 +98,20 @@ echo "$folder/weights$of.safetensors"
 
 # The light network, which learns from small scenes.
 if [ -n "$of" ]; then
-  numbers='0 1 2 3 4 5 6 7 8'
+  numbers='0 1 2 3 4 5 6 7 8 9'
   set -- --steps 60000
 else
-  numbers='3 4 5 6 7 8'
-  earlier 4d062e5338304a2469b441e3850f566a9d1857ba light-net "$folder/light-start-3.safetensors" # after its run 2
-  set -- --steps 24000 --start-from "$folder/light-start-3.safetensors"
+  numbers='3 4 5 6 7 8 9'
+  earlier 9eb59c15b7b826fc110e9e1f5d8fa147d98450f7 light-net "$folder/light-start-4.safetensors" # after its run 3
+  set -- --steps 32000 --start-from "$folder/light-start-4.safetensors"
 fi
 small=
 for n in $numbers; do
   light_net draw "$folder/light-$n" "$shapes" "$relief" --seed $((7500 + n))
   small="$small $folder/light-$n"
 done
-light_net train $small "$@" -o "$folder/light-net-3$of.safetensors"
-echo "$folder/light-net-3$of.safetensors"
+light_net train $small "$@" -o "$folder/light-net-4$of.safetensors"
+echo "$folder/light-net-4$of.safetensors"
 
 # The material net reads the tokens of the spline-net in the package, so put the new weights there first.
 #   python benchmarks/train_material_net.py draw "$folder/material"

@@ -42,13 +42,16 @@ class LightNet(nn.Module):
         fine, local, middle, coarse, joined, hidden = 32, 64, 128, 192, 96, 256
         self.enter = nn.Conv2d(INPUTS, fine, 4, stride=2, padding=1)
         self.local = nn.ModuleList(
-            (nn.Conv2d(fine, local, 3, stride=2, padding=1), nn.Conv2d(local, local, 3, padding=1))
+            (
+                nn.Conv2d(fine, local, 3, stride=2, padding=1),
+                *(nn.Conv2d(local, local, 3, padding=1) for _ in range(3)),
+            )
         )
         self.join1 = nn.Conv2d(3 * local, joined, 1)
         self.middle = nn.ModuleList(
             (
                 nn.Conv2d(joined, middle, 3, stride=2, padding=1),
-                nn.Conv2d(middle, middle, 3, padding=1),
+                *(nn.Conv2d(middle, middle, 3, padding=1) for _ in range(3)),
             )
         )
         self.join2 = nn.Conv2d(3 * middle, coarse, 1)
@@ -64,10 +67,12 @@ class LightNet(nn.Module):
             self.enter(images.flatten(0, 1).contiguous(memory_format=torch.channels_last))
         )
         x = torch.relu(self.local[0](x))
-        x = torch.relu(x + self.local[1](x))
+        for layer in self.local[1:]:
+            x = torch.relu(x + layer(x))
         x = torch.relu(self.join1(_with_all(x, lights)))
         x = torch.relu(self.middle[0](x))
-        x = torch.relu(x + self.middle[1](x))
+        for layer in self.middle[1:]:
+            x = torch.relu(x + layer(x))
         x = torch.relu(self.join2(_with_all(x, lights)))
         x = torch.relu(self.flat(torch.relu(self.coarse(x)).flatten(1)))
         x = torch.relu(x + self.join3(_with_all(x, lights)))
