@@ -114,8 +114,8 @@ class Bench:
         }
 
     def eight_bits(self, convert: Callable[[Any], Any], name: str) -> Cells:
-        """Score copies of the captures whose images have other bits,
-        on all pixels under two draws.
+        """Score copies of the captures whose images have other bits, on all pixels under two
+        draws.
         """
         copies = {
             label: rewritten(path, self.results / name, convert)
@@ -128,25 +128,29 @@ class Bench:
         return cells
 
     def range_of_8_bits(self, convert: Callable[[Any], Any]) -> Cells:
-        """Return the largest increase of an error if the brightest hundredth of the pixels is at
-        shares of the range of 8 bits, on all pixels under one draw of ten lights.
+        """Return the largest increase of an error if the brightest hundredth of the pixels of a
+        capture's brightest image is at shares of the range of 8 bits, on all pixels under one draw
+        of ten lights.
         """
         captures = {**self.objects, **self.synth, **self.statues}
-        given = {
-            r["label"]: r["mae_deg"]
-            for r in self.errors("given", captures, "spline-net", **ONE_DRAW)
-        }
+        brightest = {label: brightness(path) for label, path in captures.items()}
+
+        def errors(folder: str, captures: Mapping[str, Path]) -> dict[str, float]:
+            found: list[dict[str, Any]] = self.errors(folder, captures, "spline-net", **ONE_DRAW)
+            return {each["label"]: each["mae_deg"] for each in found}
+
         cells: Cells = {}
+        given = errors("given", captures)
         for share in tables.RANGES:
             name = f"{convert.__name__} at {share}"
-            copies = {}
-            for label, path in captures.items():
-                factor = share / brightness(path)
-                copies[label] = rewritten(
-                    path, self.results / name, lambda image, factor=factor: convert(factor * image)
+            copies = {
+                label: rewritten(
+                    path, self.results / name, partial(scaled, share / brightest[label], convert)
                 )
-            found = self.errors(f"{name} errors", copies, "spline-net", **ONE_DRAW)
-            cells[f"{share} %"] = round(max(r["mae_deg"] - given[r["label"]] for r in found), 4)
+                for label, path in captures.items()
+            }
+            found = errors(f"{name} errors", copies)
+            cells[f"{share} %"] = round(max(found[label] - given[label] for label in found), 4)
         return cells
 
     def optics(self, convert: Callable[[Any], Any], name: str) -> Cells:
@@ -425,6 +429,10 @@ def brightness(folder: Path) -> float:
     inside = cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE) > 0
     images = (cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in images_of(folder))
     return max(float(np.quantile(image[inside], 0.99)) for image in images) / 655.35
+
+
+def scaled(factor: float, convert: Callable[[Any], Any], image: Any) -> Any:
+    return convert(factor * image)
 
 
 def rounded(image: Any) -> Any:

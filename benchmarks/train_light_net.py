@@ -257,9 +257,10 @@ def widen(network: LightNet, narrow: dict[str, Tensor]) -> None:
     Its own features do not change the features of the narrow one yet.
     """
     for name, values in network.state_dict().items():
-        if (known := narrow.get(name)) is None:
+        if name not in narrow and name.startswith(("local.", "middle.")):
             values.zero_()
             continue
+        known = narrow[name]
         if values.ndim == 1:
             values[: len(known)] = known
             continue

@@ -14,6 +14,7 @@ import pytest
 import torch
 from pytest import approx
 from safetensors.numpy import load_file
+from torch.testing import assert_close
 
 from scenes import ball, parametrize, read_json
 from splinecli import __version__
@@ -21,7 +22,7 @@ from splinecli.estimate.networks.config import NetworkConfig
 from splinecli.estimate.networks.spline_net import SplineNet
 from splinecli.estimate.networks.weights import load_weights, resolve_weights
 from splinecli.judge.judge_net import CLASSES, JudgeNet
-from splinecli.lights.light_net import LIGHT_FORMAT, LightNet
+from splinecli.lights.light_net import INPUTS, LIGHT_FORMAT, SIDE, LightNet
 from splinecli.materials.material_net import MATERIAL_FORMAT, MaterialNet
 from splinecli.maths.normals import unit
 from splinecli.system.weight_files import load_module
@@ -276,6 +277,17 @@ def test_train_light_net(run, tmp_path, monkeypatch, rng):
     options = f"--steps 1 -o {tmp_path}/known.safetensors --start-from {shipped}"
     known = run(f"train_light_net train {tmp_path}/set {options}")
     assert numbers(known.split()[1])[0] < errors[1]
+
+    network, images = LightNet(), torch.rand(1, 5, INPUTS, SIDE, SIDE)
+    state = network.state_dict()
+    widen = importlib.import_module("train_light_net").widen
+    widen(deeper := LightNet(), {n: v for n, v in state.items() if ".3." not in n})
+    for values in (network.local[3], network.middle[3]):
+        torch.nn.init.zeros_(values.weight)
+        torch.nn.init.zeros_(values.bias)
+    assert_close(deeper(images), network(images))
+    with pytest.raises(KeyError):
+        widen(deeper, {})
 
     trimesh = pytest.importorskip("trimesh")
     tiny = SceneConfig(size=16, lights=8, samples=1, directions=4, bounces=1)

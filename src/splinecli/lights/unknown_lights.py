@@ -146,8 +146,8 @@ def find_lights(
         others = (differ_by_deg(each.directions, start.directions) for start in starts)
         if len(starts) < _MOST_STARTS and min(others) > _OTHER_DEG:
             starts.append(each)
-    # The network predicts too large errors for easy objects. Fitted on 170 rendered captures; the
-    # 1.2 degrees are for photographs.
+    # The network predicts too large errors for easy objects. Fitted on 170 rendered captures with
+    # an earlier one; the 1.2 degrees are for photographs.
     found_deg = math.hypot(0.28 * expected_deg**1.3, 1.2)
     found = search(
         observations,

@@ -55,7 +55,7 @@ def test_an_untrained_compact_network_gives_the_robust_lambertian_normal(pixels)
 
 
 def test_gradients_are_finite_where_a_fit_points_at_the_camera():
-    """Lights that are estimated from images follow these gradients."""
+    """The search for unknown lights descends along these gradients."""
     lights = torch.tensor([[3.0, 0, 4], [-3, 0, 4], [0, 3, 4], [0, -3, 4]]) / 5
     observations = torch.ones(1, 4)
     assert not fit_lambertian(observations, lights)[:, :2].any()

@@ -43,7 +43,7 @@ class Metrics:
     """
 
     step: int  # number of updates so far
-    pixels: int  # number of training pixels so far; of captures for a refinement net
+    pixels: int  # number of training pixels so far (captures for a refinement net)
     minutes: float  # training time so far
     learning_rate: float  # the rate of the last update
     # the weighted sum of all terms. If LI-Net and NE-Net are updated in turn, the sum of both
