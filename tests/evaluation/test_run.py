@@ -148,7 +148,7 @@ def test_a_shifted_ground_truth_under_lamps_of_unequal_brightness(tmp_path, shif
 
 
 def test_the_ground_truth_of_a_real_ball_under_unequal_lamps(shared_data, tmp_path):
-    """With the lamps taken for equal, it seemed to be shifted by 27 pixels."""
+    """If the lamps are assumed to be equal, it seems to be shifted by 27 pixels."""
     folder = tmp_path / "ball"
     shutil.copytree(
         shared_data / "DiLiGenT/pmsData/ballPNG",
