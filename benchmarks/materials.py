@@ -30,7 +30,13 @@ from splinecli.materials.lobes import Geometry
 from splinecli.materials.maps import estimate_material, lights_that_reach, render_gray
 from splinecli.workshop.synthesis.principled import PrincipledMaterial
 from splinecli.workshop.synthesis.ray_tracing import Tracer, find_visible_surface
-from splinecli.workshop.synthesis.scenes import RenderedScene, SceneConfig, draw_scene, render_scene
+from splinecli.workshop.synthesis.scenes import (
+    RenderedScene,
+    Scene,
+    SceneConfig,
+    draw_scene,
+    render_scene,
+)
 
 Floats = NDArray[np.float32]
 DRAWN = 10
@@ -53,17 +59,23 @@ def examples(seed: int, scenes: int, config: SceneConfig, sets: Sequence[str]) -
     for index in range(scenes):
         scene = draw_scene(seed, index, config)
         rendered = render_scene(scene, config)
-        visible = find_visible_surface(Tracer(scene.mesh), config.size, config.samples)
-        patches = scene.patch_of_face[visible.samples.triangle].reshape(
-            -1, visible.samples_per_pixel
-        )
-        patch = torch.from_numpy(np.sort(patches, axis=1)[:, visible.samples_per_pixel // 2])
+        patches = patch_of_pixels(scene, config)
         for name in sets:
             drawn = np.sort(rng.choice(config.lights, DRAWN, replace=False))
-            true = scene.materials[name].take(patch)
+            true = scene.materials[name].take(patches)
             yield Example(
                 f"{index} {name}", rendered, rendered.observations[name], scene.lights, true, drawn
             )
+
+
+def patch_of_pixels(scene: Scene, config: SceneConfig) -> torch.Tensor:
+    """Return the patch in the middle of each pixel (P,)."""
+    bend = None if scene.relief is None else scene.relief.bend
+    visible = find_visible_surface(
+        Tracer(scene.mesh), config.size, config.samples, bend, distance=scene.distance
+    )
+    patches = scene.patch_of_face[visible.samples.triangle].reshape(-1, visible.samples_per_pixel)
+    return torch.from_numpy(np.sort(patches, axis=1)[:, visible.samples_per_pixel // 2])
 
 
 def observable(given: Capture, normals: Floats, true: PrincipledMaterial) -> NDArray[np.bool_]:

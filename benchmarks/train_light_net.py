@@ -36,7 +36,7 @@ from splinecli.workshop.synthesis.meshes import (
     smooth_union,
     triangulate,
 )
-from splinecli.workshop.synthesis.scenes import SceneConfig, draw_scene, render_scene
+from splinecli.workshop.synthesis.scenes import Scene, SceneConfig, draw_scene, render_scene
 from splinecli.workshop.synthesis.shapes import draw_view
 from splinecli.workshop.synthesis.whole_capture import add_background
 from splinecli.workshop.training.config import PRESETS
@@ -54,7 +54,26 @@ Scenes = Sequence[tuple[PixelSet, Entry]]
 
 
 def draw(output: Path, meshes: Path, reliefs: Path, scenes: int, seed: int) -> None:
-    """Render the scenes that a set does not have, each in a set of materials of each class.
+    """Render the scenes that a set does not have, each in a set of materials of each class."""
+    writer, recipe = PixelSetWriter(output), asdict(RENDERING) | {"seed": seed}
+    for index in range(scenes):
+        name = f"scene{index:04}"
+        if f"{name}-{KINDS[-1]}" in writer:
+            continue
+        shape, scene = draw_small_scene(seed, index, meshes, reliefs)
+        rendered = render_scene(scene, RENDERING)
+        if not rendered.mask.any():
+            continue
+        source = f"rendered: {shape}"
+        for kind, observations in rendered.observations.items():
+            parts = observations.astype(np.float16), rendered.normals, scene.lights, rendered.mask
+            writer.add(f"{name}-{kind}", name, source, recipe, Pixels(*parts))
+        print(name, source, flush=True)
+    writer.finish()
+
+
+def draw_small_scene(seed: int, index: int, meshes: Path, reliefs: Path) -> tuple[str, Scene]:
+    """Draw scene number `index` of the set with this seed, and return the kind of its shape, too.
 
     40 % are groups of bodies, 15 % views of the meshes, 20 % random shapes, and 25 % smooth shapes
     (see draw_smooth).
@@ -63,32 +82,19 @@ def draw(output: Path, meshes: Path, reliefs: Path, scenes: int, seed: int) -> N
     maps = sorted(reliefs.glob("*.jpg"))
     if not files or not maps:
         raise SystemExit(f"expected meshes (.ply) in {meshes} and normal maps (.jpg) in {reliefs}")
-    writer, recipe = PixelSetWriter(output), asdict(RENDERING) | {"seed": seed}
-    for index in range(scenes):
-        name = f"scene{index:04}"
-        if f"{name}-{KINDS[-1]}" in writer:
-            continue
-        rng = np.random.default_rng([seed, index, 78])
-        number, mesh = rng.random(), None
-        if number < 0.4:
-            shape, mesh = draw_group(rng, files, rng.random())
-        elif number < 0.55:
-            place = int(rng.integers(len(files)))
-            others = files[:place] + files[place + 1 :]
-            shape, mesh = "view", draw_view(read_mesh(files[place]), others, rng)
-        elif number < 0.8:
-            shape, mesh = "smooth", draw_smooth(rng)
-        scene = draw_scene(seed, index, RENDERING, mesh, maps)
-        scene = replace(scene, materials={kind: scene.materials[kind] for kind in KINDS})
-        rendered = render_scene(scene, RENDERING)
-        if not rendered.mask.any():
-            continue
-        source = f"rendered: {scene.shape if mesh is None else shape}"
-        for kind, observations in rendered.observations.items():
-            parts = observations.astype(np.float16), rendered.normals, scene.lights, rendered.mask
-            writer.add(f"{name}-{kind}", name, source, recipe, Pixels(*parts))
-        print(name, source, flush=True)
-    writer.finish()
+    rng = np.random.default_rng([seed, index, 78])
+    number, shape, mesh = rng.random(), "", None
+    if number < 0.4:
+        shape, mesh = draw_group(rng, files, rng.random())
+    elif number < 0.55:
+        place = int(rng.integers(len(files)))
+        others = files[:place] + files[place + 1 :]
+        shape, mesh = "view", draw_view(read_mesh(files[place]), others, rng)
+    elif number < 0.8:
+        shape, mesh = "smooth", draw_smooth(rng)
+    scene = draw_scene(seed, index, RENDERING, mesh, maps)
+    materials = {kind: scene.materials[kind] for kind in KINDS}
+    return shape or scene.shape, replace(scene, materials=materials)
 
 
 def draw_smooth(rng: np.random.Generator) -> Mesh:

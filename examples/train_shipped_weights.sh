@@ -114,5 +114,6 @@ light_net train $small "$@" -o "$folder/light-net-4$of.safetensors"
 echo "$folder/light-net-4$of.safetensors"
 
 # The material net reads the tokens of the spline-net in the package, so put the new weights there first.
-#   python benchmarks/train_material_net.py draw "$folder/material"
+# Its pixels are from the scenes of the sets of the light network.
+#   python benchmarks/train_material_net.py draw "$folder/material" "$shapes" "$relief" "$folder"/light-[3-9]
 #   python benchmarks/train_material_net.py train "$folder/material" --ship
