@@ -128,6 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             page.goto(SITE)
             page.evaluate("ready")
             print(compare(page, path, output), flush=True)
+            page.close()
 
 
 if __name__ == "__main__":

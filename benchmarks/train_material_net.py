@@ -67,6 +67,7 @@ def draw(folder: Path, shapes: Path, relief: Path, sets: Sequence[Path]) -> None
     folder.mkdir(parents=True, exist_ok=True)
     network = resolve_weights("spline-net").network
     coarse = choose_precision("auto", torch.device("cpu")) == "bfloat16"
+    # The seeds are those of the shards of the shipped net.
     shards: list[tuple[int, Path | None]] = [(9000 + n, None) for n in range(SPHERES + NARROW)]
     shards += [(9080 + n, sets[n // OF_A_SET]) for n in range(OF_A_SET * len(sets))]
     for seed, of in shards:
